@@ -44,13 +44,16 @@ def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigEr
 Model = TypeVar("Model", bound=BaseModel)
 
 
-def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
+def parse(
+    model: type[Model], values: dict[str, Any], what: str, known: Iterable[str] | None = None
+) -> Model:
     """Validate ``values`` as a ``model``.
 
     Args:
         model: a pydantic model.
         values: field names and their values.
         what: what is being configured, for the error message.
+        known: names that the message on an unknown one lists; those of all fields if None.
 
     Raises:
         ConfigError: a name is unknown, a type wrong or a value out of range.
@@ -58,7 +61,7 @@ def parse(model: type[Model], values: dict[str, Any], what: str) -> Model:
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise explain(error, model.model_fields, what) from None
+        raise explain(error, model.model_fields if known is None else known, what) from None
 
 
 def _take_any_sequence(schema: Any) -> None:
@@ -320,11 +323,23 @@ class EnvConfig(StrictModel):
         Raises:
             ConfigError: one applies to the other control only.
         """
-        for name, field in EnvConfig.model_fields.items():
-            needed = (field.json_schema_extra or {}).get("control", control)
-            if needed != control and getattr(self, name) != field.default:
-                kind = needed.replace("_", "-")
+        for name in sorted(EnvConfig.model_fields.keys() - self.fields_for(control)):
+            if getattr(self, name) != EnvConfig.model_fields[name].default:
+                kind = "close-loop" if control == "open_loop" else "open-loop"
                 raise ConfigError(f"{name!r} is for {kind} tasks, which {task_id} is not")
+
+    @classmethod
+    def fields_for(cls, control: str) -> set[str]:
+        """Return the names of the fields that apply to a control.
+
+        Args:
+            control: "open_loop" or "close_loop".
+        """
+        return {
+            name
+            for name, field in cls.model_fields.items()
+            if (field.json_schema_extra or {}).get("control", control) == control
+        }
 
 
 class EnvKeywords(TypedDict, total=False):

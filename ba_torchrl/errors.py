@@ -26,9 +26,12 @@ class MissingPackageError(ConfigError, ImportError):
 
 
 def known_names(name: str, known: Sequence[str]) -> str:
-    """Return the end of a message on an unknown name: the nearest known one, and all."""
-    close = difflib.get_close_matches(name, known, n=1)
-    return (f" Did you mean {close[0]!r}?" if close else "") + f" Known: {', '.join(known)}"
+    """Return the end of a message on an unknown name: the known ones that have it as a word, or the
+    nearest one, and all."""
+    close = [each for each in known if re.search(rf"(^|[_/.]){re.escape(name)}($|[_/.])", each)]
+    close = close[:3] or difflib.get_close_matches(name, known, n=1)
+    meant = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+    return f"{meant} Known: {', '.join(known)}"
 
 
 def install_command(*packages: str) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import logging
+import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -29,6 +30,7 @@ from ba_torchrl.config import parse
 from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.config import ExperimentConfig
 
 _OF_HYDRA = ("--multirun", "-m", "--cfg", "-c", "--info", "-i", "--package", "-p", "--resolve")
 """Options of Hydra that a command with a configuration has too."""
@@ -138,7 +140,8 @@ class Command:
         is_for_hydra = self.config is not None and bool(given & {*_OF_HYDRA})
         known = ["--help", *(["--config-name", "--config-dir", *_OF_HYDRA] if self.config else [])]
         if not is_for_hydra and options:
-            raise ConfigError(f"unknown option {options[0]!r}.{known_names(options[0], known)}")
+            end = self._as_setting(options[0], words) or f".{known_names(options[0], known)}"
+            raise ConfigError(f"unknown option {options[0]!r}{end}")
         if self.config is None and (found.config_name or found.config_dir):
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
         if found.config_dir is not None and not Path(found.config_dir).is_dir():
@@ -154,6 +157,21 @@ class Command:
             found.help,
             is_for_hydra,
         )
+
+    def _as_setting(self, option: str, words: Sequence[str]) -> str:
+        """Return the end of a message on an option that is a setting; empty if it is none."""
+        name, _, value = option.lstrip("-").partition("=")
+        known = {*self.settings.model_fields}
+        if self.config is not None:
+            groups = (folder.name for folder in config_dir().iterdir() if folder.is_dir())
+            known |= {*ExperimentConfig.model_fields, *groups}
+        name = name.replace("-", "_")
+        if name.split(".")[0] not in known:
+            return ""
+        following = [*words[list(words).index(option) + 1 :], "VALUE"][0]
+        if not value:
+            value = "VALUE" if following.startswith("-") or "=" in following else following
+        return f": write {shlex.join([f'{name}={value}'])}"
 
     def _overrides(self, words: Sequence[str]) -> Iterator[str]:
         """Yield overrides; words without "=" set the positional field.

@@ -76,7 +76,9 @@ class TaskDescription:
                 f"{name} {low:g} to {high:g}" for name, (low, high) in self.actions.items()
             ),
             "max_steps": f"{self.max_steps}",
-            "scale": f"{_span(self.object_scale_range)} ({_span(self.object_scale_limits)})",
+            "object_scale_range": (
+                f"{_span(self.object_scale_range)} ({_span(self.object_scale_limits)})"
+            ),
         }
         if len(self.numbers_of_objects) > 1:
             least, *others = self.numbers_of_objects
@@ -92,7 +94,7 @@ class TaskDescription:
         return rows
 
     def __str__(self) -> str:
-        rows = (f"  {name + ':':14}{value}" for name, value in self.rows().items())
+        rows = (f"  {name + ':':20}{value}" for name, value in self.rows().items())
         return "\n".join([self.task, "", self.text, "", *rows])
 
 

@@ -157,7 +157,8 @@ def resolve_env(
     task_class = TASKS[task_id]
     model = env_config_model(task_class.Parameters)
     given = _own_values(task_id, values, model)
-    config = parse(model, given, what or f"configuration of {task_id}")
+    known = model.fields_for(task_class.control)
+    config = parse(model, given, what or f"configuration of {task_id}", known)
     config.check_control(task_id, task_class.control)
     _check_task_supports(task_id, config)
     _ = ROBOTS[config.robot]  # raises with the known names

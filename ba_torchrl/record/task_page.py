@@ -7,6 +7,9 @@ from collections.abc import Iterable, Sequence
 from ba_torchrl import describe
 from ba_torchrl.tasks.base import TASKS
 
+GENERAL_KEYWORDS = ("max_steps", "object_scale_range", "num_objects")
+"""Rows of every task that are keywords of `ba_torchrl.make`."""
+
 
 def task_page(tasks: Sequence[str] | None = None) -> str:
     """Return a Markdown page with a section for each task.
@@ -21,7 +24,8 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
         "",
         "Written by `ba-torchrl tasks path=...` from the sources. Success is the conjunction of",
         "the conditions in a valid scene at rest. `env.conditions` and Gymnasium's `info` hold",
-        "them after every step. Allowed values are in brackets.",
+        "them after every step. Rows with names in code are keywords of `ba_torchrl.make`, on the",
+        "command line `env.max_steps=20`, with their default and in brackets what is allowed.",
     ]
     for heading, ids in tasks_by_heading(tasks).items():
         lines += ["", f"## {heading}"]
@@ -33,7 +37,11 @@ def task_page(tasks: Sequence[str] | None = None) -> str:
 def _section(task: str) -> list[str]:
     """Return the lines of a task's section."""
     found = describe(task)
-    rows = (f"- {name}: {value}" for name, value in found.rows().items())
+    keywords = {*GENERAL_KEYWORDS, *found.parameters}
+    rows = (
+        f"- `{name}`: {value}" if name in keywords else f"- {name}: {value}"
+        for name, value in found.rows().items()
+    )
     return [f"### `{task}`", "", found.text, "", *rows]
 
 

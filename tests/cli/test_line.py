@@ -50,6 +50,13 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
     [
         (["trian"], "unknown command 'trian'. Did you mean 'train'?"),
         (["train", "--confg-name", "x"], "unknown option '--confg-name'. Did you mean '--config"),
+        (["train", "--total_updates", "10"], "'--total_updates': write total_updates=10"),
+        (["train", "--total-updates=10"], "'--total-updates=10': write total_updates=10"),
+        (["train", "--env.obs_size", "64"], "write env.obs_size=64"),
+        (["train", "--replay", "per"], "write replay=per"),
+        (["train", "--resume"], "write resume=VALUE"),
+        (["benchmark", "--tasks=[a,b]"], "write 'tasks=[a,b]'"),
+        (["collect", "--episodes", "5"], "write episodes=5"),
         (["train", "--config", "x"], "unknown option '--config'. Did you mean '--config-"),
         (["train", "--cfg", "job", "sed=1"], "unknown setting 'sed'. Did you mean 'seed'?"),
         (["train", "-m", "sed=1,2"], "unknown setting 'sed'. Did you mean 'seed'?"),
@@ -59,6 +66,11 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
         (["train", "--config-name"], "expected one argument"),
         (["train", "--config-dir", "nowhere"], "there is no folder nowhere"),
         (["train", "env.obs_siez=64"], "Did you mean 'obs_size'?"),
+        (["train", "env.scale=3"], "Did you mean 'object_scale_range' or 'view_scale'?"),
+        (
+            ["train", "task=open_loop/block_stacking", "algorithm=dqn", "env.scale=3"],
+            "Did you mean 'object_scale_range'?",
+        ),
         (["train", "algorithm.lerning_rate=1"], "Did you mean 'learning_rate'?"),
         (["train", "algorithm=dqn", "algorithm.magrin=1"], "unknown setting 'algorithm.magrin'"),
         (["train", "network.wdith=1", "network=cnn"], "Did you mean 'width'?"),
@@ -226,6 +238,6 @@ def test_tasks_are_listed_described_and_written(tmp_path, capsys):
     cli.main(["tasks"])
     assert "  close_loop/block_picking           the block is held" in capsys.readouterr().out
     cli.main(["tasks", "close_loop/block_picking"])
-    assert "expert:       kuka 1.000 in 7.0 steps" in capsys.readouterr().out
+    assert "expert:             kuka 1.000 in 7.0 steps" in capsys.readouterr().out
     cli.main(["tasks", "close_loop/block_picking", f"path={tmp_path / 'page.md'}"])
     assert "### `close_loop/block_picking`" in (tmp_path / "page.md").read_text()

@@ -18,9 +18,10 @@ def test_a_section_has_description_conditions_and_parameters():
     page = task_page(["close_loop/object_grasping"])
     assert "### `close_loop/object_grasping`" in page
     assert "- success: is_grasped, is_lifted" in page
-    assert "- object_set: 'random'. Name of the object set" in page
-    assert "- max_attempts: None. Episodes with the same heap" in page
-    assert "- num_objects: 5 (1 to 15)" in page
+    assert "- `object_set`: 'random'. Name of the object set" in page
+    assert "- `max_attempts`: None. Episodes with the same heap" in page
+    assert "- `num_objects`: 5 (1 to 15)" in page
+    assert "- `object_scale_range`: 1 (" in page
     assert "block_picking" not in page
 
 
