@@ -24,6 +24,15 @@ from ba_torchrl.errors import ConfigError, known_names
 
 Interval = tuple[float, float]
 
+MAX_ENVS = 1024
+"""Largest number of environments of a vector: PyBullet's number of worlds."""
+Source = Literal["expert", "deconstruction"]
+"""How demonstrations are made: by an expert, or by reversing deconstruction episodes."""
+CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
+"""Mode of `torch.compile`; all but the first replay CUDA graphs on a GPU."""
+Which = Literal["best", "latest"]
+"""Of a run's checkpoints, the one with the highest success rate in evaluation, or the last."""
+
 
 def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigError:
     """Return pydantic's errors as one `ConfigError` that says what is allowed."""

@@ -36,6 +36,11 @@ class PluginWarning(UserWarning):
     """An installed plugin cannot be imported."""
 
 
+def has_entry_points() -> bool:
+    """Whether installed packages declare plugins."""
+    return bool(entry_points(group=GROUP))
+
+
 def load_entry_points() -> None:
     """Import the plugins that installed packages declare, once per process.
 

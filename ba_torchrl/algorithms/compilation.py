@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
-from typing import Literal, get_args
+from typing import get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,11 +13,9 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 
+from ba_torchrl.config import CompileMode
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-
-CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
-"""Mode of `torch.compile`; all but the first replay CUDA graphs on a GPU."""
 
 
 def check_compiler(device: torch.device) -> None:

@@ -28,6 +28,7 @@ from ba_torchrl.cli.errors import name_presets, plain_errors
 from ba_torchrl.cli.help import describe
 from ba_torchrl.config import parse
 from ba_torchrl.errors import ConfigError, known_names
+from ba_torchrl.plugins import has_entry_points, load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
@@ -73,6 +74,8 @@ class Command:
     """Pattern of the names of other configuration files that the package has for this command."""
     parse: Callable[[dict[str, Any], Arguments], Any] | None = None
     """Returns what ``main`` gets; by default an instance of ``settings``."""
+    check: Callable[[dict[str, Any]], object] | None = None
+    """Of a command with a configuration: refuses wrong settings as far as this needs no torch."""
 
     @property
     def name(self) -> str:
@@ -88,7 +91,12 @@ class Command:
         """
         words = sys.argv[1:] if words is None else words
         arguments = self.read(words)
-        hydra_schema.register(arguments.overrides)
+        if self.config is None:
+            load_plugins(hydra_schema.plugins_in(arguments.overrides))
+        elif self._is_answered_early(arguments):
+            return
+        else:
+            hydra_schema.register(arguments.overrides)
         if arguments.is_for_hydra and not arguments.asks_for_help:
             with self.composed(arguments):  # an unknown name ends it here
                 pass
@@ -97,15 +105,36 @@ class Command:
         logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
         with self.composed(arguments) as settings:
             if arguments.asks_for_help:
-                print(self._help(OmegaConf.to_container(settings)))  # noqa: T201
+                print(self._help(OmegaConf.to_container(settings), True))  # noqa: T201
             else:
                 self._run_composed(settings, arguments)
 
-    def _help(self, values: dict[str, Any]) -> str:
+    def _is_answered_early(self, arguments: Arguments) -> bool:
+        """Refuse what is wrong, or print the help, without the import of torch, which takes
+        seconds; return whether the command line is answered.
+
+        Plugins and further folders can have other presets, so that the answer has to wait.
+
+        Raises:
+            ConfigError: a setting is wrong.
+        """
+        if arguments.config_dir or "plugins" in arguments.names or has_entry_points():
+            return False
+        hydra_schema.register_open(config_dir())
+        groups = {name.split(".")[0] for name in arguments.names} & {*hydra_schema.GROUPS}
+        with self.composed(arguments) as settings:
+            if arguments.asks_for_help and not groups:
+                print(self._help(OmegaConf.to_container(settings), False))  # noqa: T201
+                return True
+            if self.check is not None and not (arguments.asks_for_help or arguments.is_for_hydra):
+                self._apply(self.check, settings)
+        return False
+
+    def _help(self, values: dict[str, Any], with_choices: bool) -> str:
         word = f" [{self.positional.upper()}]" if self.positional else ""
         usage = f"{self.name}{word} [FIELD=VALUE ...]"
         text = sys.modules[self.main.__module__].__doc__ or ""
-        return describe(usage, text, self.settings, values, self.config_names())
+        return describe(usage, text, self.settings, values, self.config_names(), with_choices)
 
     def config_names(self, further: str | None = None) -> list[str]:
         """Return the names that ``--config-name`` takes.
@@ -240,17 +269,25 @@ class Command:
         return f"_{self.name}"
 
     def _run_composed(self, settings: DictConfig, arguments: Arguments) -> None:
-        limit_library_logs()
-        missing = sorted(name for name in settings if OmegaConf.is_missing(settings, name))
-        if missing:
-            raise ConfigError(f"{missing[0]} is missing; see --help")
-        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
-        try:
+        def run(values: dict[str, Any]) -> None:
             if self.parse is None:
                 found = parse(self.settings, values, "settings")
             else:
                 found = self.parse(values, arguments)
             self.main(found)
+
+        limit_library_logs()
+        self._apply(run, settings)
+
+    @staticmethod
+    def _apply(function: Callable[[dict[str, Any]], object], settings: DictConfig) -> None:
+        """Call a function with the values of the settings; its errors name presets."""
+        missing = sorted(name for name in settings if OmegaConf.is_missing(settings, name))
+        if missing:
+            raise ConfigError(f"{missing[0]} is missing; see --help")
+        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+        try:
+            function(values)
         except ConfigError as error:
             raise ConfigError(name_presets(str(error), settings)) from error
 

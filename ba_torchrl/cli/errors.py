@@ -9,7 +9,6 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-import torch
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
@@ -61,7 +60,7 @@ def plain_errors(function: Callable[..., Any]) -> Callable[..., Any]:
             _end(error, "out of memory")
         except RuntimeError as error:
             is_memory = any(words in str(error) for words in _OUT_OF_MEMORY)
-            if is_memory or isinstance(error, torch.OutOfMemoryError):
+            if is_memory or type(error).__name__ == "OutOfMemoryError":  # of torch
                 _end(error, "out of memory")
             of_system = as_os_error(error)
             if of_system is None or of_system.errno not in _RESOURCES:
@@ -84,9 +83,10 @@ def name_presets(message: str, settings: DictConfig) -> str:
             message += f"\n  {group}={choices[group]} sets it; this algorithm cannot have it"
     for group, preset in choices.items():
         chosen = settings.get(group)
-        known = hydra_schema.GROUPS.get(group, {})
-        if preset and isinstance(chosen, DictConfig) and chosen.get("name") in known:
-            message = message.replace(f"{group} {chosen.name!r}", f"{group} {preset!r}")
+        named = f"{group} {chosen.get('name')!r}" if isinstance(chosen, DictConfig) else ""
+        is_named = preset and named and named in message
+        if is_named and chosen.name in hydra_schema.registries().get(group, {}):
+            message = message.replace(named, f"{group} {preset!r}")
         start, listed, names = message.partition(f"tasks take {group}: ")
         if listed:
             presets = hydra_schema.presets_of(group, names.split(", "))

@@ -16,16 +16,12 @@ from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
 from ba_torchrl.config import EnvConfig, env_config_model
-from ba_torchrl.data.formats.base import FORMATS
-from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
 CHOICES = {
-    "format": FORMATS,
-    "observations": OBSERVATIONS,
     "robot": ROBOTS,
     "robots": ROBOTS,
     "view_type": VIEWS,
@@ -35,7 +31,12 @@ _INDENT = 6
 
 
 def describe(
-    usage: str, text: str, model: type[BaseModel], values: Mapping[str, Any], names: Sequence[str]
+    usage: str,
+    text: str,
+    model: type[BaseModel],
+    values: Mapping[str, Any],
+    names: Sequence[str],
+    with_choices: bool,
 ) -> str:
     """Return the help of a command.
 
@@ -46,6 +47,8 @@ def describe(
         values: its composed settings, unresolved; the presets among them decide which fields the
             parts of the settings have.
         names: of its configuration files.
+        with_choices: whether the fields of the chosen algorithm, network, collector and launcher
+            are listed, whose models import torch.
     """
     lines = [f"usage: {PROGRAM} {usage}", "", *text.strip().splitlines()]
     if names:
@@ -55,18 +58,23 @@ def describe(
         for group in HydraConfig.get().runtime.choices:
             if "/" not in group:
                 lines += _wrapped(f"  {group}=", " | ".join(hydra_schema.preset_names(group)))
-    parts = list(_parts(model, values))
+    parts = list(_parts(model, values, with_choices))
     expanded = {prefix for _, _, _, prefix in parts}
     for title, model, own, prefix in parts:
         lines += ["", f"{title}:"]
         for name, field in model.model_fields.items():
             if (name in own or field.is_required()) and f"{prefix}{name}." not in expanded:
                 lines += _field(f"{prefix}{name}", field, own.get(name))
+    chosen = _chosen(values)
+    if chosen and not with_choices:
+        choices = HydraConfig.get().runtime.choices
+        words = " ".join(f"{group}={choices[group]}" for group in chosen)
+        lines += ["", f"fields of {', '.join(chosen)}: {PROGRAM} {usage.split()[0]} --help {words}"]
     return "\n".join(lines)
 
 
 def _parts(
-    settings: type[BaseModel], values: Mapping[str, Any]
+    settings: type[BaseModel], values: Mapping[str, Any], with_choices: bool
 ) -> Iterator[tuple[str, type[BaseModel], Mapping[str, Any], str]]:
     """Yield title, model, values and prefix of each part of the settings."""
     yield "settings", settings, values, ""
@@ -78,11 +86,16 @@ def _parts(
         for name in {"seed", "expert"} - values["env"].keys():
             del own[name]
         yield f"env, the environment{f' of {task}' if known else ''}", model, own, "env."
-    for group, registry in hydra_schema.GROUPS.items():
-        chosen = values.get(group) or {}
-        if chosen.get("name") in registry:
+    for group in _chosen(values) if with_choices else ():
+        chosen, registry = values[group], hydra_schema.registries()[group]
+        if chosen["name"] in registry:
             model = registry[chosen["name"]]
             yield f"{group}={chosen['name']}", model, chosen, f"{group}."
+
+
+def _chosen(values: Mapping[str, Any]) -> list[str]:
+    """Return the groups of presets from which the settings choose."""
+    return [group for group in hydra_schema.GROUPS if (values.get(group) or {}).get("name")]
 
 
 def _field(name: str, field: FieldInfo, value: Any) -> list[str]:

@@ -13,12 +13,11 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ba_torchrl.config import MAX_SEED, StrictModel
-from ba_torchrl.data.time_reversal import check_has_structure
-from ba_torchrl.envs.vector.make import MAX_ENVS
+from ba_torchrl.config import MAX_ENVS, MAX_SEED, StrictModel
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.structures.base import check_has_structure
 
 MAX_NAME_BYTES = 230
 """Longest name of a file that a command writes. File systems allow 255 bytes, of which temporary

@@ -22,9 +22,9 @@ from pydantic import Field
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig, choose
-from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, split, status
 
 
@@ -62,8 +62,17 @@ def parse(values: dict[str, Any], arguments: Arguments) -> Task:
     return Task(settings, runs, arguments.overrides)
 
 
+def check(values: dict[str, Any]) -> None:
+    """Refuse wrong fields of the grid and unknown tasks, without torch."""
+    settings, _ = split(values, Settings)
+    for task in settings.tasks:
+        _ = TASKS[task]
+
+
 def main(task: Task) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
+    from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
+
     config, runs, only = task.settings, task.runs, task.settings.only
     if config.dry_run:
         states = {run.run_dir: status(run) for run in runs}
@@ -99,4 +108,4 @@ def main(task: Task) -> None:
     print(f"  next    ba-torchrl report {config.folder}")
 
 
-COMMAND = Command(main, Settings, config="benchmark", parse=parse)
+COMMAND = Command(main, Settings, config="benchmark", parse=parse, check=check)

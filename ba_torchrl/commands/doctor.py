@@ -14,17 +14,10 @@ from collections.abc import Iterator, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
-import torch
-
 from ba_torchrl import __version__
 from ba_torchrl._malloc import tune_malloc
 from ba_torchrl.cli import EXIT_CODE, OF_TRAINING, config_dir
-from ba_torchrl.envs.vector.torchrl_names import missing_names
 from ba_torchrl.errors import MissingPackageError, install_command
-from ba_torchrl.hardware import hardware
-from ba_torchrl.modules.layers import compute_dtype
-from ba_torchrl.modules.steerable.planar_escnn import import_escnn
-from ba_torchrl.training.policy import shipped_policies
 
 NEEDED = (
     "torch",
@@ -53,7 +46,7 @@ class Finding(NamedTuple):
 
 
 class Doctor:
-    """The command. It needs no package that it reports as missing."""
+    """The command. It needs no package that it reports as missing, and imports them at the end."""
 
     def run(self, words: Sequence[str]) -> None:
         """Print the findings; the exit code is 1 if something that is needed is missing."""
@@ -68,12 +61,13 @@ class Doctor:
 
 def main() -> None:
     """Print the findings; the exit code is 1 if something that is needed is missing."""
-    findings = list(find())
-    for finding in findings:
-        print(f"{finding.name:22} {finding.state}")
+    is_complete = True
+    for finding in find():
+        print(f"{finding.name:22} {finding.state}", flush=True)
         if finding.fix:
             print(f"{'':22}   -> {finding.fix}")
-    if any(finding.state == "missing" for finding in findings):
+        is_complete = is_complete and finding.state != "missing"
+    if not is_complete:
         sys.exit(1)
 
 
@@ -84,20 +78,19 @@ def find() -> Iterator[Finding]:
     for name in (*NEEDED, *OF_TRAINING):
         found = _version(name)
         yield Finding(name, found or "missing", "" if found else install_command(name))
-    yield _escnn()
     for name in OPTIONAL:
         yield Finding(name, _version(name) or "not installed (optional)")
-    machine = hardware(torch.device("cpu"))
-    yield Finding("cpu", f"{machine['cpu']}, {machine['cores']} cores, {machine['memory_gb']} GB")
-    yield _cpu_path()
-    yield _gpu()
-    yield _native_trees()
-    yield _vector()
     is_tuned = tune_malloc()
     yield Finding("memory allocator", "tuned glibc" if is_tuned else "of the system")
     yield _shared_memory()
     yield _display()
-    yield Finding("trained policies", ", ".join(shipped_policies()) or "none")
+    for check in (_escnn, _cpu, _cpu_path, _gpu, _native_trees, _vector, _policies):
+        try:
+            yield check()
+        except ModuleNotFoundError as error:
+            if (error.name or "").split(".")[0] not in NEEDED:
+                raise
+            yield Finding(check.__name__.strip("_"), f"not known without {error.name}")
 
 
 def _version(name: str) -> str | None:
@@ -108,6 +101,8 @@ def _version(name: str) -> str | None:
 
 
 def _escnn() -> Finding:
+    from ba_torchrl.modules.steerable.planar_escnn import import_escnn
+
     try:
         import_escnn()
     except MissingPackageError as error:
@@ -115,13 +110,28 @@ def _escnn() -> Finding:
     return Finding("escnn", _version("escnn") or "without version")
 
 
+def _cpu() -> Finding:
+    import torch
+
+    from ba_torchrl.hardware import hardware
+
+    found = hardware(torch.device("cpu"))
+    return Finding("cpu", f"{found['cpu']}, {found['cores']} cores, {found['memory_gb']} GB")
+
+
 def _cpu_path() -> Finding:
+    import torch
+
+    from ba_torchrl.modules.layers import compute_dtype
+
     dtype = compute_dtype("auto", torch.device("cpu"))
     kind = str(dtype).removeprefix("torch.")
     return Finding("networks on the cpu", f"{kind} ({torch.backends.cpu.get_cpu_capability()})")
 
 
 def _gpu() -> Finding:
+    import torch
+
     if not torch.cuda.is_available():
         return Finding("gpu", "none that torch can use")
     return Finding("gpu", f"{torch.cuda.get_device_name()}, CUDA {torch.version.cuda}")
@@ -137,11 +147,19 @@ def _native_trees() -> Finding:
 
 
 def _vector() -> Finding:
+    from ba_torchrl.envs.vector.torchrl_names import missing_names
+
     missing = missing_names()
     if not missing:
         return Finding("make_vector_env", "replaces workers that fail")
     fix = f"pip install 'torchrl>=0.14' (without {', '.join(missing)})"
     return Finding("make_vector_env", "TorchRL's ParallelEnv: workers are not replaced", fix)
+
+
+def _policies() -> Finding:
+    from ba_torchrl.training.policy import shipped_policies
+
+    return Finding("trained policies", ", ".join(shipped_policies()) or "none")
 
 
 def _shared_memory() -> Finding:

@@ -9,20 +9,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
-import torch
 from pydantic import Field
 
-from ba_torchrl import make_vector_env
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text
-from ba_torchrl.data import collect_demonstrations, expert_policy
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.duration import WARM_UP_UPDATES, compute_path
+
+if TYPE_CHECKING:
+    import torch
 
 LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn")}
 """Algorithm and usual network by control."""
@@ -56,6 +54,8 @@ class Settings(EnvSettings):
 
 def main(settings: Settings) -> None:
     """Print a table, row by row."""
+    from ba_torchrl.training.duration import compute_path
+
     learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
     print(f"{'':52} {'per second':>10}")
     for task in settings.tasks:
@@ -80,6 +80,9 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
         num_envs: number of environments.
         parallel: one process per environment.
     """
+    from ba_torchrl import make_vector_env
+    from ba_torchrl.data import expert_policy
+
     env = make_vector_env(
         task,
         num_envs,
@@ -132,6 +135,11 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
         config: of the learner.
         settings: of the measurement.
     """
+    from ba_torchrl import make_vector_env
+    from ba_torchrl.data import collect_demonstrations
+    from ba_torchrl.training.checkpoint import build_algorithm
+    from ba_torchrl.training.duration import WARM_UP_UPDATES
+
     algorithm = build_algorithm(config)
     env = make_vector_env(config.resolved_env, 1, parallel=False, seed=settings.seed, expert=True)
     try:
@@ -150,6 +158,8 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
 
 
 def _wait(device: torch.device) -> None:
+    import torch
+
     if device.type == "cuda":
         torch.cuda.synchronize(device)
 

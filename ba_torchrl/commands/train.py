@@ -17,10 +17,7 @@ from typing import Any
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
 from ba_torchrl.record.results import CONFIG_FILE, NON_LEARNING_FIELDS
-from ba_torchrl.training.checkpoint import read_config
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.experiment import Experiment
-from ba_torchrl.training.interruption import RunStopped
 
 logger = logging.getLogger(__name__)
 
@@ -35,6 +32,8 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
     is_resumed = values["resume"] is True and (Path(values["run_dir"]) / CONFIG_FILE).exists()
     if values["resume"] is True and not is_resumed:
         logger.warning("there is no run in %s to resume: a new one starts", values["run_dir"])
+    from ba_torchrl.training.checkpoint import read_config
+
     if is_resumed and arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
         return read_config(values["run_dir"], **{name: values[name] for name in arguments.names})
     return ExperimentConfig.parse(values)
@@ -42,6 +41,9 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
 
 def main(config: ExperimentConfig) -> None:
     """Run or resume the experiment."""
+    from ba_torchrl.training.experiment import Experiment
+    from ba_torchrl.training.interruption import RunStopped
+
     check_writable_folder(config.run_dir)
     try:
         result = Experiment(config).run()
@@ -65,4 +67,11 @@ def main(config: ExperimentConfig) -> None:
     print("    env.rollout(env.max_steps, policy)")
 
 
-COMMAND = Command(main, ExperimentConfig, config="train", variants="quickstart*", parse=parse)
+COMMAND = Command(
+    main,
+    ExperimentConfig,
+    config="train",
+    variants="quickstart*",
+    parse=parse,
+    check=ExperimentConfig.check_fields,
+)

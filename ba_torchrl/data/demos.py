@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, NamedTuple, get_args
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -13,14 +13,13 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ba_torchrl._generators import seeded_generator
+from ba_torchrl.config import Source
 from ba_torchrl.data.episodes import collect_episodes, is_success, success_rate
 from ba_torchrl.data.time_reversal import DeconstructionEnv, is_reversible, reverse_episode
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make, make_vector_env
 from ba_torchrl.errors import ConfigError
 
-Source = Literal["expert", "deconstruction"]
-"""How demonstrations are made: by an expert, or by reversing deconstruction episodes."""
 SOURCES: tuple[Source, ...] = get_args(Source)
 
 

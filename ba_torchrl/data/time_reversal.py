@@ -21,8 +21,7 @@ from ba_torchrl.envs.open_loop import OpenLoopEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import StructureTask
+from ba_torchrl.tasks.structures.base import check_has_structure
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction, UndoRecorder
 
 _ENDS = (
@@ -117,17 +116,6 @@ def make_deconstruction_env(task: str, **config: Any) -> DeconstructionEnv:
     """
     check_has_structure(task)
     return DeconstructionEnv(resolve_env(task, config))
-
-
-def check_has_structure(task: str) -> None:
-    """Check that a task has a structure that can be taken apart.
-
-    Raises:
-        ConfigError: it has none.
-    """
-    if not issubclass(TASKS[task], StructureTask):
-        possible = ", ".join(name for name in TASKS if issubclass(TASKS[name], StructureTask))
-        raise ConfigError(f"deconstruction has no meaning for {task}; it is for {possible}")
 
 
 def is_reversible(episode: TensorDictBase) -> bool:

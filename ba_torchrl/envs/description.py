@@ -9,7 +9,6 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from ba_torchrl.envs.factory import make
 from ba_torchrl.tasks.base import TASKS
 
 EXPERT_SCORES = "expert_scores.json"
@@ -113,6 +112,8 @@ def describe(task: str) -> TaskDescription:
     Raises:
         ConfigError: there is no such task; the message lists the known ones.
     """
+    from ba_torchrl.envs.factory import make  # imports torch
+
     cls = TASKS[task]
     env = make(task, seed=0)
     try:

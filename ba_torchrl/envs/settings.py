@@ -9,7 +9,6 @@ from typing import Any, ClassVar, Protocol
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.config import EnvConfig, env_config_model, parse
-from ba_torchrl.envs.observations import OBSERVATIONS, enabled_classes
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import MAIN, check_spawned_process_knows, import_modules
 from ba_torchrl.registry import Registry
@@ -154,14 +153,8 @@ def resolve_env(
         values, modules = {**task.given, **values}, (*task.modules, *modules)
     task_id = task.task_id if isinstance(task, ResolvedEnv) else task
     import_modules(modules)
+    config, given = check_env(task_id, values, what)
     task_class = TASKS[task_id]
-    model = env_config_model(task_class.Parameters)
-    given = _own_values(task_id, values, model)
-    known = model.fields_for(task_class.control)
-    config = parse(model, given, what or f"configuration of {task_id}", known)
-    config.check_control(task_id, task_class.control)
-    _check_task_supports(task_id, config)
-    _ = ROBOTS[config.robot]  # raises with the known names
     config = _with_defaults(task_class, config)
     actions = CONTROLS[task_class.control].make_actions(config)
     missing = sorted(task_class.required_action_components - set(actions.components))
@@ -172,6 +165,8 @@ def resolve_env(
         )
     registering = (module for *_, module in _plugins(task_id, config) if module not in MAIN)
     modules = tuple(dict.fromkeys([*modules, *registering]))
+    from ba_torchrl.envs.observations import enabled_classes  # imports torch
+
     uses_camera = any(part.uses_camera for part in enabled_classes(config))
     if config.camera_size is not None and not uses_camera:
         raise ConfigError(
@@ -181,12 +176,35 @@ def resolve_env(
     return ResolvedEnv(task_id, config, actions, modules, given)
 
 
+def check_env(
+    task_id: str, values: dict[str, Any], what: str | None = None
+) -> tuple[EnvConfig, dict[str, Any]]:
+    """Validate the parameters of an environment as far as this needs no torch.
+
+    Arguments and errors are those of `resolve_env`.
+
+    Returns:
+        The parameters, and the values from which they follow.
+    """
+    task_class = TASKS[task_id]
+    model = env_config_model(task_class.Parameters)
+    given = _own_values(task_id, values, model)
+    known = model.fields_for(task_class.control)
+    config = parse(model, given, what or f"configuration of {task_id}", known)
+    config.check_control(task_id, task_class.control)
+    _check_task_supports(task_id, config)
+    _ = ROBOTS[config.robot]  # raises with the known names
+    return config, given
+
+
 def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], str, str]]:
     """Yield the parts that modules outside the package have registered.
 
     Yields:
         Registry, name in it, and module.
     """
+    from ba_torchrl.envs.observations import OBSERVATIONS  # imports torch
+
     parts = [(TASKS, task_id), (ROBOTS, config.robot)]
     parts += [(OBSERVATIONS, name) for name in config.observations]
     for registry, name in parts:

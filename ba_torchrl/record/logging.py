@@ -9,14 +9,16 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from torchrl.record.loggers import Logger, get_logger
 from tqdm import tqdm
 
 from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.record.results import flat
+
+if TYPE_CHECKING:
+    from torchrl.record.loggers import Logger
 
 Backend = Literal["csv", "tensorboard", "wandb"]
 
@@ -56,6 +58,8 @@ def make_logger(
             f"the logger {backend!r} needs a package that is not installed: "
             + install_command(backend)
         )
+    from torchrl.record.loggers import get_logger
+
     options = {"wandb_kwargs": {"project": "ba-torchrl"}} if backend == "wandb" else {}
     logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)
     known = (int, float, str)  # types that every backend supports

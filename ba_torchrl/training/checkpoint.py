@@ -5,13 +5,14 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import torch
 from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner, Problem
+from ba_torchrl.config import Which
 from ba_torchrl.data.files import read_json, write_text
 from ba_torchrl.envs.factory import make
 from ba_torchrl.errors import ConfigError
@@ -25,9 +26,6 @@ from ba_torchrl.training.persistence import (
     saved_steps,
     step_of,
 )
-
-Which = Literal["best", "latest"]
-"""Of a run's checkpoints, the one with the highest success rate in evaluation, or the last."""
 
 
 class Checkpoints:

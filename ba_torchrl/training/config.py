@@ -1,37 +1,30 @@
-"""ExperimentConfig: everything that determines a training run."""
+"""ExperimentConfig: everything that determines a training run.
+
+Its fields are known, and most of their values checked, without the import of torch, which takes
+seconds; methods import what needs it.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import torch
 from pydantic import Field
 
-from ba_torchrl.algorithms.base import (
-    ALGORITHMS,
-    NETWORKS,
-    LearnerConfig,
-    NetworkConfig,
-    SeedUse,
-    derive_seed,
-)
-from ba_torchrl.algorithms.compilation import CompileMode
-from ba_torchrl.config import MAX_SEED, WorkerOptions, changed, parse
-from ba_torchrl.data.demo_files import check_demonstrations
-from ba_torchrl.data.demos import (
-    Source,
-    check_noise,
-    check_turn_noise,
-)
-from ba_torchrl.data.time_reversal import check_has_structure
-from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
+from ba_torchrl.config import MAX_SEED, CompileMode, Source, WorkerOptions, changed, parse
+from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.errors import ConfigError, install_command
 from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
-from ba_torchrl.training.collectors.base import COLLECTORS, CollectorConfig
+from ba_torchrl.tasks.structures.base import check_has_structure
+
+if TYPE_CHECKING:
+    import torch
+
+    from ba_torchrl.algorithms.base import LearnerConfig, NetworkConfig, SeedUse
+    from ba_torchrl.training.collectors.base import CollectorConfig
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
 """Fields of `EnvConfig` that are not for the user to set."""
@@ -159,16 +152,22 @@ class ExperimentConfig(WorkerOptions):
     @cached_property
     def network_config(self) -> NetworkConfig:
         """The network's hyper-parameters."""
+        from ba_torchrl.algorithms.base import NETWORKS
+
         return choose(NETWORKS, self.network, "network")
 
     @cached_property
     def algorithm_config(self) -> LearnerConfig:
         """The algorithm's hyper-parameters."""
+        from ba_torchrl.algorithms.base import ALGORITHMS
+
         return choose(ALGORITHMS, self.algorithm, "algorithm")
 
     @cached_property
     def collector_config(self) -> CollectorConfig:
         """The collector's options."""
+        from ba_torchrl.training.collectors.base import COLLECTORS
+
         return choose(COLLECTORS, self.collector, "collector")
 
     def derived_seed(self, use: SeedUse, part: int = 0) -> int:
@@ -178,6 +177,8 @@ class ExperimentConfig(WorkerOptions):
             use: what the environments serve.
             part: number of a further set of episodes for the same use, after a resumption.
         """
+        from ba_torchrl.algorithms.base import derive_seed
+
         return derive_seed(self.seed, use, part)
 
     def resolved(self) -> dict[str, Any]:
@@ -220,11 +221,7 @@ class ExperimentConfig(WorkerOptions):
         Raises:
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
-        config = parse(cls, values, what)
-        load_plugins(config.plugins)
-        for reserved in SET_BY_THE_EXPERIMENT:
-            if reserved in config.env:
-                raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
+        config = cls.check_fields(values, what)
         if config.resolved_env.config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
         control = config.resolved_env.task_class.control
@@ -264,8 +261,26 @@ class ExperimentConfig(WorkerOptions):
         usable_device(config.device)
         return config.model_copy(update={"plugins": config._all_plugins()})
 
+    @classmethod
+    def check_fields(cls, values: dict[str, Any], what: str = "experiment") -> ExperimentConfig:
+        """Validate everything that needs no torch: the fields, and those of the environment.
+
+        Raises:
+            ConfigError: as `parse`.
+        """
+        config = parse(cls, values, what)
+        load_plugins(config.plugins)
+        for reserved in SET_BY_THE_EXPERIMENT:
+            if reserved in config.env:
+                raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
+        check_env(config.task, config.env, "env")
+        return config
+
     def _all_plugins(self) -> list[str]:
         """Return `plugins` and the modules that register what the run uses, each once."""
+        from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+        from ba_torchrl.training.collectors.base import COLLECTORS
+
         used = (
             (NETWORKS, self.network["name"]),
             (ALGORITHMS, self.algorithm["name"]),
@@ -301,6 +316,9 @@ class ExperimentConfig(WorkerOptions):
             )
 
     def _check_demonstrations(self) -> None:
+        from ba_torchrl.data.demo_files import check_demonstrations
+        from ba_torchrl.data.demos import check_noise, check_turn_noise
+
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         check_turn_noise(
             self.demonstrations_turn_noise,
@@ -333,6 +351,8 @@ def usable_device(name: str) -> torch.device:
     Raises:
         ConfigError: there is no such device.
     """
+    import torch
+
     try:
         device = _as_device(name)
         torch.zeros(1, device=device).item()
@@ -343,6 +363,8 @@ def usable_device(name: str) -> torch.device:
 
 
 def _as_device(name: str) -> torch.device:
+    import torch
+
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     return torch.device(name)

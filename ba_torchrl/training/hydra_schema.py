@@ -1,12 +1,17 @@
 """Hydra's schemas of the recipes: every field with its default, taken from the code.
 
-Any field can therefore be set on the command line, and no default is written twice.
+Any field can therefore be set on the command line, and no default is written twice. The fields of
+algorithms, networks, collectors and launchers are those of models beside modules that import torch,
+which takes seconds; `register_open` makes schemas that do without.
 """
 
 from __future__ import annotations
 
 import contextlib
+import functools
+import re
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 from hydra import compose
@@ -17,14 +22,20 @@ from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.plugins import load_plugins
-from ba_torchrl.training.collectors.base import COLLECTORS
+from ba_torchrl.registry import Registry
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
-from ba_torchrl.training.grid.launchers.base import LAUNCHERS
 from ba_torchrl.training.grid.plan import SET_BY_THE_GRID, BenchmarkConfig
+
+GROUPS = ("algorithm", "network", "collector", "launcher")
+"""Folders of presets in ``configs`` that choose from a registry."""
+
+_plugin_presets: dict[str, set[str]] = {}
+"""By group, the entries of plugins, which are presets."""
+_is_complete = [False]
+"""Whether the schemas of all choices are those of `register`."""
 
 
 def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
@@ -36,13 +47,14 @@ def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
     }
 
 
-GROUPS = {
-    "algorithm": ALGORITHMS,
-    "network": NETWORKS,
-    "collector": COLLECTORS,
-    "launcher": LAUNCHERS,
-}
-"""Folders of presets in ``configs``, and the registry that each chooses from."""
+@functools.cache
+def registries() -> dict[str, Registry[Any]]:
+    """Return the registry of each of `GROUPS`; imports torch."""
+    from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+    from ba_torchrl.training.collectors.base import COLLECTORS
+    from ba_torchrl.training.grid.launchers.base import LAUNCHERS
+
+    return dict(zip(GROUPS, (ALGORITHMS, NETWORKS, COLLECTORS, LAUNCHERS), strict=True))
 
 
 def register(arguments: Sequence[str] = ()) -> None:
@@ -58,7 +70,42 @@ def register(arguments: Sequence[str] = ()) -> None:
     Raises:
         ConfigError: a plugin cannot be imported.
     """
-    load_plugins(_plugins_in(arguments))
+    load_plugins(plugins_in(arguments))
+    _register_settings()
+    store = ConfigStore.instance()
+    for group, registry in registries().items():
+        for name in registry:
+            node = OmegaConf.create({"name": name, **defaults_of(registry[name])})
+            for field in node:
+                if OmegaConf.is_dict(node[field]):  # open: its entries are those of another program
+                    OmegaConf.set_struct(node[field], False)
+            store.store(group=f"{group}/schema", name=name, node=node)
+            if registry.plugin_module(name) is not None:
+                *folders, last = name.split("/")
+                where = "/".join([group, *folders])
+                store.store(group=where, name=last, node=node, package=group)
+                _plugin_presets.setdefault(group, set()).add(name)
+    _is_complete[0] = True
+
+
+def register_open(folder: Path) -> None:
+    """Make schemas known in which the choices of `GROUPS` can have any fields; imports no torch.
+
+    Args:
+        folder: of the presets, whose choices need not be in a registry.
+    """
+    _register_settings()
+    for group in GROUPS:
+        texts = (path.read_text(encoding="utf-8") for path in (folder / group).glob("*.yaml"))
+        for name in re.findall(r"\bschema/(\w+)", "\n".join(texts)):
+            node = OmegaConf.create({"name": name})
+            OmegaConf.set_struct(node, False)
+            ConfigStore.instance().store(group=f"{group}/schema", name=name, node=node)
+    _is_complete[0] = False
+
+
+def _register_settings() -> None:
+    """Make the schemas of environment, experiment and grid known, and the resolvers."""
     store = ConfigStore.instance()
     env = {
         name: value
@@ -79,17 +126,6 @@ def register(arguments: Sequence[str] = ()) -> None:
     for name in ("env", "algorithm", "network", "per_task", "per_algorithm", "per_network"):
         OmegaConf.set_struct(grid[name], False)
     store.store(name="grid", node=grid)
-    for group, registry in GROUPS.items():
-        for name in registry:
-            node = OmegaConf.create({"name": name, **defaults_of(registry[name])})
-            for field in node:
-                if OmegaConf.is_dict(node[field]):  # open: its entries are those of another program
-                    OmegaConf.set_struct(node[field], False)
-            store.store(group=f"{group}/schema", name=name, node=node)
-            if registry.plugin_module(name) is not None:
-                *folders, last = name.split("/")
-                where = "/".join([group, *folders])
-                store.store(group=where, name=last, node=node, package=group)
     OmegaConf.register_new_resolver(
         "if_equal",
         lambda value, other, then, otherwise: then if value == other else otherwise,
@@ -121,6 +157,8 @@ def preset(group: str, name: str) -> dict[str, Any]:
     Raises:
         ConfigError: there is no such preset; the message lists the known ones.
     """
+    if not _is_complete[0]:
+        register()
     known = preset_names(group)
     first = max((each for each in known if f"{name}_".startswith(f"{each}_")), key=len, default="")
     overrides, parts = [f"+{group}={first}"], name.removeprefix(first).split("_")[1:]
@@ -149,12 +187,10 @@ def presets_of(group: str, names: Iterable[str]) -> list[str]:
 def preset_names(group: str) -> list[str]:
     """Return the names of a group's presets; Hydra must have been started."""
     files = GlobalHydra.instance().config_loader().get_group_options(group)
-    registry = GROUPS.get(group, {})
-    plugins = [name for name in registry if registry.plugin_module(name) is not None]
-    return sorted({*files, *plugins})
+    return sorted({*files, *_plugin_presets.get(group, ())})
 
 
-def _plugins_in(arguments: Iterable[str]) -> list[str]:
+def plugins_in(arguments: Iterable[str]) -> list[str]:
     """Return the modules that ``plugins=[...]`` of a command line names.
 
     Hydra composes the configuration from the presets, so the plugins that add some come first.

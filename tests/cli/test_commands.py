@@ -98,7 +98,6 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     load_recipe(name)  # else modules that it imports would keep `started`
     monkeypatch.chdir(tmp_path)
     # in this order: each looks up what the next one replaces
-    monkeypatch.setattr("ba_torchrl.envs.description.make", started)
     monkeypatch.setattr("ba_torchrl.make", started)
     monkeypatch.setattr("ba_torchrl.envs.factory.make", started)
     monkeypatch.setattr("ba_torchrl.training.experiment.Experiment.run", started)

@@ -2,6 +2,8 @@
 
 import random
 import signal
+import subprocess
+import sys
 
 import pytest
 
@@ -32,6 +34,38 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
     for name in cli.command_names():
         first = load_recipe(name).__doc__.splitlines()[0]
         assert f"{name:10} {first}" in out
+
+
+WITHOUT_TORCH = [
+    *([name, "--help"] for name in cli.command_names()),
+    ["train", "--config-name", "quickstart", "--help"],
+    ["tran"],
+    ["train", "--total_updates", "10"],
+    ["train", "sed=1"],
+    ["train", "network=cnnn"],
+    ["train", "total_updates=many"],
+    ["train", "task=close_loop/block_pickng"],
+    ["train", "env.obs_siz=64"],
+    ["train", "env.obs_size=3"],
+    ["benchmark", "tasks=[close_loop/block_pickng]"],
+    ["benchmark", "jobs=0"],
+    ["tasks"],
+    *([name, "seed=a"] for name in ("collect", "evaluate", "experts", "export", "play", "speed")),
+    ["report", "run=a"],
+]
+"""Command lines that are answered without the import of torch, which takes seconds."""
+
+
+def test_help_and_mistakes_are_answered_without_torch():
+    code = (
+        "import sys\nfrom ba_torchrl import cli\n"
+        f"for words in {WITHOUT_TORCH}:\n"
+        "    try:\n        cli.main(words)\n    except SystemExit as end:\n"
+        "        assert end.code == cli.EXIT_CODE, words\n"
+        "    assert not {'torch', 'tensordict', 'torchrl'} & sys.modules.keys(), words\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[-2000:]
 
 
 @pytest.mark.parametrize("words", [["--help"], ["doctor"], ["train", "--help"], ["tasks"]])
@@ -202,7 +236,7 @@ def test_errors_of_a_run_are_not_hidden(tmp_path, monkeypatch):
     def broken(_):
         raise ZeroDivisionError
 
-    monkeypatch.setattr(train, "Experiment", broken)
+    monkeypatch.setattr("ba_torchrl.training.experiment.Experiment", broken)
     with pytest.raises(ZeroDivisionError):
         train.main(tiny(tmp_path))
 
@@ -212,7 +246,7 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
 
     monkeypatch.setattr(doctor, "OPTIONAL", ())
     monkeypatch.setattr(doctor, "NEEDED", ("torch", "no-such-package"))
-    monkeypatch.setattr(doctor, "missing_names", lambda: ("_gone",))
+    monkeypatch.setattr("ba_torchrl.envs.vector.torchrl_names.missing_names", lambda: ("_gone",))
     with pytest.raises(SystemExit) as end:
         doctor.COMMAND.run([])
     out = capsys.readouterr().out
@@ -226,7 +260,7 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
 @pytest.mark.slow
 def test_speed_prints_rates(capsys, monkeypatch):
     words = ["close_loop/block_reaching", "env.obs_size=64", "steps=4", "num_envs=2", "updates=1"]
-    monkeypatch.setattr("ba_torchrl.commands.speed.WARM_UP_UPDATES", 0)
+    monkeypatch.setattr("ba_torchrl.training.duration.WARM_UP_UPDATES", 0)
     cli.main(["speed", *words, "networks=[cnn]"])
     rows = [line for line in capsys.readouterr().out.splitlines() if "block_reaching" in line]
     assert len(rows) == 4

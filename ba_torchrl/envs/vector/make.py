@@ -15,7 +15,7 @@ import torch
 from tensordict import TensorDictBase
 from torchrl.envs import EnvBase, ParallelEnv, SerialEnv
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.config import MAX_ENVS, WorkerOptions
 from ba_torchrl.envs.checks import check_actions
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import SeededVector
@@ -36,7 +36,6 @@ logger = logging.getLogger(__name__)
 
 MakeEnv = Callable[[], EnvBase]
 
-MAX_ENVS = 1024
 _SHARED_MEMORY = Path("/dev/shm")
 
 MIN_CONCURRENT_PROCESSES = 3

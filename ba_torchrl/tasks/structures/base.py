@@ -10,9 +10,10 @@ from typing import Any, ClassVar
 import numpy as np
 
 from ba_torchrl.actions import GripperCommand, PickPlaceCommand
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.shapes import Color
-from ba_torchrl.tasks.base import BLUE, GREEN, RED, CloseLoopTask, OpenLoopTask, Task
+from ba_torchrl.tasks.base import BLUE, GREEN, RED, TASKS, CloseLoopTask, OpenLoopTask, Task
 from ba_torchrl.tasks.instructions import structure_instruction
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD, Blueprint, Piece
 from ba_torchrl.tasks.structures.experts import PickPlaceExpert, gripper_command
@@ -217,3 +218,14 @@ class CloseLoopStructureTask(StructureGoal, CloseLoopTask):
     def expert_command(self) -> GripperCommand:
         """Return the command of the planner's next move."""
         return gripper_command(self.structure, self.robot, self.action_limits)
+
+
+def check_has_structure(task: str) -> None:
+    """Check that a task has a structure that can be taken apart.
+
+    Raises:
+        ConfigError: it has none.
+    """
+    if not issubclass(TASKS[task], StructureTask):
+        possible = ", ".join(name for name in TASKS if issubclass(TASKS[name], StructureTask))
+        raise ConfigError(f"deconstruction has no meaning for {task}; it is for {possible}")

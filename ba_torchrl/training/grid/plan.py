@@ -9,12 +9,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-import torch
 from pydantic import Field
 
-from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.config import StrictModel, parse
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import load_plugins
@@ -26,10 +24,10 @@ from ba_torchrl.record.results import (
     read_result,
 )
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training.checkpoint import build_algorithm, parse_saved, problem_of, read_config
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.persistence import lock_holder
-from ba_torchrl.training.resume import check_same_run, resumable_updates
+
+if TYPE_CHECKING:
+    from ba_torchrl.algorithms.base import Problem
 
 SET_BY_THE_GRID = ("task", "seed", "label", "run_dir", "resume", "benchmark")
 """Fields of `ExperimentConfig` that differ from run to run."""
@@ -215,6 +213,10 @@ def status(run: ExperimentConfig) -> Status:
     Raises:
         ConfigError: its folder holds a run with other settings.
     """
+    from ba_torchrl.training.checkpoint import parse_saved, read_config
+    from ba_torchrl.training.persistence import lock_holder
+    from ba_torchrl.training.resume import check_same_run, resumable_updates
+
     folder = run.folder
     if (folder / RESULT_FILE).exists():
         try:
@@ -284,6 +286,10 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
 
     Tasks and robots check some parameters, networks some sizes and actions.
     """
+    import torch
+
+    from ba_torchrl.training.checkpoint import build_algorithm, problem_of
+
     problems: dict[tuple[str, str], Problem] = {}
     built = set()
     for run in runs:

@@ -177,7 +177,7 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
 
 
 def test_offline_learning_reads_each_set_and_plays_no_episode(monkeypatch):
-    monkeypatch.setattr("ba_torchrl.training.config.check_demonstrations", lambda *_, **__: None)
+    monkeypatch.setattr("ba_torchrl.data.demo_files.check_demonstrations", lambda *_, **__: None)
     config, _, runs = shipped("offline")
     methods = {"close_loop": {"bc cnn", "iql cnn"}, "open_loop": {"bc asr", "sdqfd asr"}}
     found = {(run.task, run.label) for run in runs}
