@@ -16,12 +16,14 @@ from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
 from ba_torchrl.config import EnvConfig, env_config_model
+from ba_torchrl.data.formats.base import FORMATS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 
 CHOICES = {
+    "format": FORMATS,
     "robot": ROBOTS,
     "robots": ROBOTS,
     "view_type": VIEWS,

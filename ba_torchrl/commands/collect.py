@@ -13,12 +13,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
-from ba_torchrl import make_vector_env
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
     Count,
@@ -31,22 +30,15 @@ from ba_torchrl.cli.types import (
     check_writable_file,
     check_writable_folder,
 )
-from ba_torchrl.config import changed
-from ba_torchrl.data.demo_files import read_metadata, save_demonstrations
-from ba_torchrl.data.demos import (
-    Source,
-    check_noise,
-    check_turn_noise,
-    collect_demonstrations,
-    source_config,
-)
-from ba_torchrl.data.episodes import mean_length, success_rate
+from ba_torchrl.config import Source, changed
 from ba_torchrl.data.files import complete_only
-from ba_torchrl.data.time_reversal import check_has_structure, replay_scores
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.training.graded import ACCEPTED, GRADES, GradedSets, untrained
+from ba_torchrl.tasks.structures.base import check_has_structure
+
+if TYPE_CHECKING:
+    from ba_torchrl.training.graded import GradedSets
 
 _NOT_GRADED = ("replays", "only_successful", "noise", "turn_noise")
 
@@ -81,6 +73,8 @@ class Settings(VectorSettings, EnvSettings):
                 raise ConfigError(message)
             if len(set(self.task)) < len(self.task):
                 raise ConfigError("task: name each one once")
+            from ba_torchrl.training.graded import untrained
+
             for sets in self.graded_sets():
                 try:
                     untrained(sets)
@@ -102,6 +96,8 @@ class Settings(VectorSettings, EnvSettings):
 
     def graded_sets(self) -> Iterator[GradedSets]:
         """Yield the graded sets of each task."""
+        from ba_torchrl.training.graded import GradedSets
+
         for task in self.task:
             yield GradedSets(
                 self.folder / task,
@@ -125,6 +121,9 @@ def main(settings: Settings) -> None:
 
 def _collect_graded(settings: Settings) -> None:
     """Make every set that is missing; a task that has no medium policy does not stop the others."""
+    from ba_torchrl.data.demo_files import read_metadata
+    from ba_torchrl.training.graded import ACCEPTED, GRADES
+
     problems = []
     least, most = ACCEPTED
     for sets in settings.graded_sets():
@@ -148,6 +147,17 @@ def _collect_graded(settings: Settings) -> None:
 
 def _collect(settings: Settings) -> None:
     """Play the expert's episodes, or deconstruct structures."""
+    from ba_torchrl import make_vector_env
+    from ba_torchrl.data.demo_files import save_demonstrations
+    from ba_torchrl.data.demos import (
+        check_noise,
+        check_turn_noise,
+        collect_demonstrations,
+        source_config,
+    )
+    from ba_torchrl.data.episodes import mean_length, success_rate
+    from ba_torchrl.data.time_reversal import replay_scores
+
     (task,) = settings.task
     path = settings.folder
     actions = resolve_env(task, settings.env).actions

@@ -13,11 +13,9 @@ import hashlib
 import json
 from dataclasses import asdict, fields
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from tensordict import TensorDict
-
-from ba_torchrl import __version__, load_policy, make_vector_env
+from ba_torchrl import __version__
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
     Count,
@@ -29,15 +27,18 @@ from ba_torchrl.cli.types import (
     VectorSettings,
     VideoFile,
 )
+from ba_torchrl.config import Which
 from ba_torchrl.data.files import read_json, write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import wilson_interval
 from ba_torchrl.record.video import write_video
-from ba_torchrl.training.agreement import agreement_table, check_comparable
-from ba_torchrl.training.checkpoint import Which
-from ba_torchrl.training.evaluation import Evaluation, evaluate, record_episodes
-from ba_torchrl.training.policy import TrainedPolicy, shipped_policies
+
+if TYPE_CHECKING:
+    from tensordict import TensorDict
+
+    from ba_torchrl.training.evaluation import Evaluation
+    from ba_torchrl.training.policy import TrainedPolicy
 
 
 class EpisodeSettings(VectorSettings, PluginSettings):
@@ -73,6 +74,8 @@ class Settings(EpisodeSettings):
 
 def main(settings: Settings) -> None:
     """Play greedy episodes with a policy, or with every policy that the package ships."""
+    from ba_torchrl.training.policy import shipped_policies
+
     if settings.policy != "trained":
         if settings.task is not None:
             raise ConfigError("task: the policy names its task; leave it out")
@@ -104,6 +107,9 @@ def play(
         episodes: which they are appended to.
         expert: add the expert's actions to them.
     """
+    from ba_torchrl import make_vector_env
+    from ba_torchrl.training.evaluation import evaluate
+
     seed = policy.test_seed if settings.seed is None else settings.seed
     env = make_vector_env(
         policy.config.resolved_env,
@@ -127,6 +133,10 @@ def play(
 
 
 def _evaluate(source: str, settings: Settings) -> None:
+    from ba_torchrl import load_policy
+    from ba_torchrl.training.agreement import agreement_table, check_comparable
+    from ba_torchrl.training.evaluation import record_episodes
+
     policy = load_policy(source, settings.which, settings.device)
     if settings.expert:
         check_comparable(policy.task)
@@ -164,6 +174,8 @@ def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:
 
     It is played again if the policy's file, the episodes or the version of the package are others.
     """
+    from ba_torchrl.training.evaluation import Evaluation
+
     file = Path(settings.folder) / f"{policy.task.replace('/', '_')}.json"
     asked: dict[str, Any] = {
         "task": policy.task,

@@ -18,16 +18,12 @@ from typing import Annotated
 
 from pydantic import Field
 
-from ba_torchrl import load_policy
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Text, check_writable_file, checked
 from ba_torchrl.commands import evaluate
 from ba_torchrl.config import changed
-from ba_torchrl.data.demo_files import read_demonstrations
-from ba_torchrl.data.exchange import export_demonstrations
 from ba_torchrl.data.formats.base import FORMATS, card_file
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.training.policy import TENSORS, round_weights, save_policy
 
 _OF_POLICIES = ("which", "device", "episodes", "seed", "num_envs", "parallel")
 
@@ -51,6 +47,9 @@ class Settings(evaluate.EpisodeSettings):
 
 def main(settings: Settings) -> None:
     """Write a policy, or demonstrations."""
+    from ba_torchrl.data.demo_files import read_demonstrations
+    from ba_torchrl.data.exchange import export_demonstrations
+
     if (settings.policy is None) == (settings.demos is None):
         raise ConfigError("name either a policy or demos=FOLDER")
     if settings.policy is not None:
@@ -80,6 +79,9 @@ def main(settings: Settings) -> None:
 
 def _export_policy(source: str, settings: Settings) -> None:
     """Evaluate the policy, and write it with its card."""
+    from ba_torchrl import load_policy
+    from ba_torchrl.training.policy import TENSORS, round_weights, save_policy
+
     if settings.format is not None:
         raise ConfigError("format: it is for demos; leave it out")
     policy = load_policy(source, settings.which, settings.device)

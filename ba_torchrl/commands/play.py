@@ -16,24 +16,20 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import TYPE_CHECKING, Annotated, ClassVar
 
-import torch
 from pydantic import Field
 
-from ba_torchrl import load_policy, make
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NewPath, TaskId, Text, VideoFile
-from ba_torchrl.data.demo_files import save_demonstrations
-from ba_torchrl.data.demos import expert_policy
-from ba_torchrl.data.episodes import Policy, success_rate
 from ba_torchrl.data.files import complete_only
-from ba_torchrl.data.teleoperation import Keyboard, KeyEvents, record_demonstrations
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
-from ba_torchrl.training.evaluation import record_episodes
+
+if TYPE_CHECKING:
+    from ba_torchrl.data.episodes import Policy
 
 
 class Settings(EnvSettings):
@@ -60,6 +56,10 @@ class Settings(EnvSettings):
 
 def main(settings: Settings) -> None:
     """Play episodes and write a video of them, or demonstrations."""
+    import torch
+
+    from ba_torchrl.training.evaluation import record_episodes
+
     if settings.policy == "keyboard":
         _record_keyboard(settings)
         return
@@ -85,6 +85,9 @@ def _print_episode(number: int, steps: int, is_success: bool) -> None:
 
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
     """Return the environment and the policy that acts, None for random actions."""
+    from ba_torchrl import load_policy
+    from ba_torchrl.data.demos import expert_policy
+
     is_loaded = settings.policy not in ("expert", "random")
     if settings.task is None and (not is_loaded or settings.policy == "trained"):
         raise ConfigError(f"task is missing: policy={settings.policy} acts in any, see --help")
@@ -100,6 +103,11 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
 
 def _record_keyboard(settings: Settings) -> None:
     """Write the episodes that a person plays, the complete ones if it is interrupted."""
+    from ba_torchrl import make
+    from ba_torchrl.data.demo_files import save_demonstrations
+    from ba_torchrl.data.episodes import success_rate
+    from ba_torchrl.data.teleoperation import Keyboard, KeyEvents, record_demonstrations
+
     if settings.task is None or settings.path is None:
         missing = "task" if settings.task is None else "path, a folder for the demonstrations,"
         raise ConfigError(f"{missing} is missing: policy=keyboard needs it")

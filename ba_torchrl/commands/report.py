@@ -77,6 +77,7 @@ def completed(run: RunResult) -> RunResult:
 @functools.cache
 def _planned(benchmark: str) -> dict[tuple[str, str], ExperimentConfig]:
     """Return the runs of one of the package's benchmarks by task and label."""
+    hydra_schema.register()
     overrides = [f"benchmark={benchmark}", f"name={benchmark}", "seeds=[0]"]
     values = OmegaConf.to_container(compose("benchmark", overrides), resolve=True)
     grid, common = split(values, benchmark_command.Settings)

@@ -1,17 +1,44 @@
 """Demonstrations, replay, sampling and augmentation."""
 
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.augmentation.views import RandomViews
-from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations, expert_policy, expert_scores
-from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
-from ba_torchrl.data.exchange import export_demonstrations
-from ba_torchrl.data.replay.buffer import FrameReplayBuffer
-from ba_torchrl.data.replay.make import make_replay
-from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.data.replay.symmetric import SymmetricSampler
-from ba_torchrl.data.transitions import as_transitions
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ba_torchrl.data.augmentation.rigid import RigidAugmentation
+    from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+    from ba_torchrl.data.augmentation.views import RandomViews
+    from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
+    from ba_torchrl.data.demos import collect_demonstrations, expert_policy, expert_scores
+    from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
+    from ba_torchrl.data.exchange import export_demonstrations
+    from ba_torchrl.data.replay.buffer import FrameReplayBuffer
+    from ba_torchrl.data.replay.make import make_replay
+    from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+    from ba_torchrl.data.replay.symmetric import SymmetricSampler
+    from ba_torchrl.data.transitions import as_transitions
+
+_MODULES = {
+    "ExpertPrioritizedSampler": "replay.prioritized",
+    "FrameReplayBuffer": "replay.buffer",
+    "RandomViews": "augmentation.views",
+    "RigidAugmentation": "augmentation.rigid",
+    "SO2Augmentation": "augmentation.so2",
+    "SymmetricSampler": "replay.symmetric",
+    "as_transitions": "transitions",
+    "collect_demonstrations": "demos",
+    "collect_episodes": "episodes",
+    "expert_policy": "demos",
+    "expert_scores": "demos",
+    "export_demonstrations": "exchange",
+    "load_demonstrations": "demo_files",
+    "make_replay": "replay.make",
+    "mean_length": "episodes",
+    "save_demonstrations": "demo_files",
+    "success_rate": "episodes",
+}
+"""Modules of the names, imported at their first use: files and formats need no torch."""
 
 __all__ = [
     "ExpertPrioritizedSampler",
@@ -32,3 +59,13 @@ __all__ = [
     "save_demonstrations",
     "success_rate",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -22,14 +22,15 @@ from codecs import BOM_UTF8
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
 
 from ba_torchrl.errors import ConfigError, DamagedFilesError
+
+if TYPE_CHECKING:
+    import torch
 
 OLD = ".old"
 """Suffix of a folder that `complete_only` replaces."""
@@ -229,6 +230,8 @@ def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
     Raises:
         OSError: there is not enough space, or the file cannot be written.
     """
+    from safetensors.torch import save_file
+
     try:
         save_file(tensors, path)
     except SafetensorError as error:
@@ -274,6 +277,8 @@ def read_state(folder: str | Path) -> dict[str, Any]:
 
 def _encoded(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
     """Return a state as JSON values, and collect its tensors under the names that it has there."""
+    import torch  # here: commands write texts without it
+
     if value is None or isinstance(value, bool | int | float | str):
         return value
     if isinstance(value, list):

@@ -6,12 +6,15 @@ import errno
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from ba_torchrl.data.files import replaced
-from ba_torchrl.envs.base import ManipulationEnv
 from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
+
+if TYPE_CHECKING:
+    from ba_torchrl.envs.base import ManipulationEnv
 
 _SUFFIXES = (".mp4", ".gif")
 MIN_FPS, MAX_FPS = 1, 240

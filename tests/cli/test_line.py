@@ -257,6 +257,20 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
     assert "trained policies       close_loop/block_in_bowl, close_loop/block_picking" in out
 
 
+def test_doctor_goes_on_without_torch(capsys, monkeypatch):
+    from ba_torchrl.commands import doctor
+
+    monkeypatch.setitem(sys.modules, "torch", None)
+    monkeypatch.setattr(doctor, "_version", lambda name: None if name == "torch" else "1")
+    with pytest.raises(SystemExit) as end:
+        doctor.COMMAND.run([])
+    out = capsys.readouterr().out
+    assert end.value.code == 1
+    assert "torch                  missing\n" in out
+    assert "gpu                    not known without torch\n" in out
+    assert "shared memory          " in out
+
+
 @pytest.mark.slow
 def test_speed_prints_rates(capsys, monkeypatch):
     words = ["close_loop/block_reaching", "env.obs_size=64", "steps=4", "num_envs=2", "updates=1"]

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-from ba_torchrl.record import logging as record_logging
 from ba_torchrl.record.logging import ScalarLog, make_logger, progress_bar, read_scalars
 
 
@@ -28,10 +27,11 @@ class FakeLogger:
 def fake_backend(monkeypatch):
     """Pretend that every backend is installed; return the fake logger and its arguments."""
     logger, calls = FakeLogger(), []
-    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
     monkeypatch.setattr(
-        record_logging, "get_logger", lambda *args, **kwargs: calls.append((args, kwargs)) or logger
+        "torchrl.record.loggers.get_logger",
+        lambda *args, **kwargs: calls.append((args, kwargs)) or logger,
     )
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name)
     return logger, calls
 
 

@@ -277,7 +277,8 @@ def test_results_of_the_shipped_policies_are_kept(tmp_path, capsys, monkeypatch)
         return evaluation.Evaluation(settings.episodes, 0.5, 0.1, 7.0)
 
     monkeypatch.setattr(evaluate, "play", play)
-    monkeypatch.setattr(evaluate, "shipped_policies", lambda: ["close_loop/block_picking"])
+    shipped = "ba_torchrl.training.policy.shipped_policies"
+    monkeypatch.setattr(shipped, lambda: ["close_loop/block_picking"])
     words = ("trained", f"folder={tmp_path}", "episodes=20")
     recipe("evaluate", *words)
     first = capsys.readouterr().out

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-import torch
 from pydantic import Field, ValidationError, field_validator
 from safetensors.numpy import load_file
 
@@ -257,6 +256,8 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
         episodes: their entries by key.
         card: of the episodes.
     """
+    import torch
+
     named = []
     for arrays in episodes:
         moved = {}
