@@ -149,7 +149,7 @@ def test_a_full_disk_is_an_error_of_the_system(tmp_path, monkeypatch):
     def full(*_):
         raise SafetensorError("Error while serializing: I/O error: No space left (os error 28)")
 
-    monkeypatch.setattr(files, "save_file", full)
+    monkeypatch.setattr("safetensors.torch.save_file", full)
     with pytest.raises(OSError, match="No space left on device") as error:
         write_state(tmp_path / "state", STATE)
     assert error.value.errno == errno.ENOSPC
