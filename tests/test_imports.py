@@ -22,7 +22,7 @@ EXTRA = {
     "algorithms": {"__init__", "modules", "objectives"},
     "training": {"__init__", "record", "hardware"},
     "cli": {"__init__", "record"},
-    "commands": {"__init__", "record", "hardware", "modules", "envs.vector"},
+    "commands": {"__init__", "record", "hardware", "modules"},
     "__main__": {"cli"},
     "recipes": {"__init__", "record"},
 }

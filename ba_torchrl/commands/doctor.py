@@ -84,7 +84,7 @@ def find() -> Iterator[Finding]:
     yield Finding("memory allocator", "tuned glibc" if is_tuned else "of the system")
     yield _shared_memory()
     yield _display()
-    for check in (_escnn, _cpu, _cpu_path, _gpu, _native_trees, _vector, _policies):
+    for check in (_escnn, _cpu, _cpu_path, _gpu, _native_trees, _policies):
         try:
             yield check()
         except ModuleNotFoundError as error:
@@ -144,16 +144,6 @@ def _native_trees() -> Finding:
     except ImportError:
         return Finding("prioritised replay", "trees in Python: TorchRL's do not fit this torch")
     return Finding("prioritised replay", "TorchRL's native trees")
-
-
-def _vector() -> Finding:
-    from ba_torchrl.envs.vector.torchrl_names import missing_names
-
-    missing = missing_names()
-    if not missing:
-        return Finding("make_vector_env", "replaces workers that fail")
-    fix = f"pip install 'torchrl>=0.14' (without {', '.join(missing)})"
-    return Finding("make_vector_env", "TorchRL's ParallelEnv: workers are not replaced", fix)
 
 
 def _policies() -> Finding:

@@ -49,8 +49,8 @@ def make_vector_env(
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
 
-    They are a TorchRL ``ParallelEnv`` that survives its workers, or with ``parallel=False`` a
-    ``SerialEnv``. The same seed gives the same episodes in both.
+    They are one TorchRL environment, in processes that are replaced when they fail, or with
+    ``parallel=False`` in this process. The same seed gives the same episodes in both.
 
     Args:
         task: as for `make`.

@@ -1,4 +1,6 @@
 import multiprocessing
+import os
+import signal
 import sys
 from functools import partial
 from pathlib import Path
@@ -7,6 +9,7 @@ import pytest
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs.vector.make import make_vector
+from ba_torchrl.envs.vector.parallel import VectorEnv
 
 # Spawned workers inherit this path and find the modules of the tests there.
 sys.path.insert(0, str(Path(__file__).parent))
@@ -28,7 +31,7 @@ def make_fakes():
 
     yield make
     for env in made:
-        for worker in getattr(env, "parent_channels", ()):
-            worker.abort()  # faster than an orderly end, which tests of `close` look at
+        for pid in env.worker_pids if isinstance(env, VectorEnv) else ():
+            os.kill(pid, signal.SIGKILL)  # faster than an orderly end, which tests of `close` see
         env.close(raise_if_closed=False)
     assert multiprocessing.active_children() == []

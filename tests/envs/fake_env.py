@@ -1,6 +1,7 @@
 """Shared parts of the tests of vectors: a small environment that fails on demand, and checks."""
 
 import contextlib
+import multiprocessing
 import os
 import sys
 import time
@@ -116,6 +117,13 @@ class FakeEnv(EnvBase):
         out = self._observe(truncated=end, done=end)
         out["reward"] = tensordict["action"].sum(-1, keepdim=True)
         return out
+
+
+def kill(pid):
+    """Kill a worker process and wait until it has ended."""
+    (process,) = (each for each in multiprocessing.active_children() if each.pid == pid)
+    process.kill()
+    process.join()
 
 
 def act(env, td, value=0.1):

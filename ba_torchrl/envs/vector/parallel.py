@@ -1,29 +1,27 @@
-"""VectorEnv: TorchRL's ParallelEnv, with replacement of failed workers."""
+"""VectorEnv: environments in worker processes, which are replaced when they fail."""
 
 from __future__ import annotations
 
-import contextlib
+import logging
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from ctypes import Array, c_byte
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any, SupportsIndex
 
-import torch
-from tensordict import NonTensorStack, TensorDictBase
-from torch import multiprocessing as mp
+import numpy as np
+from tensordict import NonTensorStack, TensorDict, TensorDictBase
+from torchrl.data import Composite, NonTensor
 from torchrl.data.utils import CloudpickleWrapper
-from torchrl.envs import EnvBase, EnvCreator, ParallelEnv
-from torchrl.envs.batched_envs import _run_worker_pipe_shared_mem
+from torchrl.envs import EnvCreator
 
 from ba_torchrl.config import WorkerOptions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.envs.vector.batching import SeededVector
-from ba_torchrl.envs.vector.replacement import Replacements, seed_worker
-from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker, wait_until
-from ba_torchrl.errors import WorkerError
+from ba_torchrl.envs.vector.batching import MakeEnv, Vector
+from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
+from ba_torchrl.errors import ConfigError, WorkerError
 
-MakeEnv = Callable[[], EnvBase]
+logger = logging.getLogger(__name__)
 
 _STEP_S = 1.0
 """Upper bound of the duration of a step that is repeated."""
@@ -37,18 +35,21 @@ _LOST_STEP = {
 }
 _ABSENT = {**_LOST_STEP, keys.TRUNCATED: False, keys.DONE: False}
 _START_POLL_S = 1.0
-_HEALTH_CHECK_S = 5e-3
+_POLLING_S = 0.1
+_POLL_INTERVAL_S = 30e-6
+
+Command = tuple[str, tuple[Any, ...], dict[str, Any]]
+"""Name, arguments and keywords of a method of the worker's environment."""
 
 
-class VectorEnv(SeededVector, ParallelEnv):
+class VectorEnv(Vector):
     """Environments in worker processes; a worker that ends or hangs is replaced.
 
     The other workers keep their episodes, and step while the new worker starts. For the environment
     of the failed worker, the step returns the last valid observation with ``fault``, ``truncated``
     and ``done`` set and a reward of zero; TorchRL then resets it like any environment that is done.
-    Actions are validated in this process before they are sent. An error that an environment raises
-    is raised in this process, caused by one with the worker's traceback; only the next reset or
-    step replaces the worker. Errors of the simulator and of memory replace it at once.
+    An error that an environment raises is raised in this process, caused by one with the traceback
+    of the worker, which continues. Errors of the simulator and of memory replace the worker.
 
     This reset waits for the new worker, unless ``workers.wait_for_restarts`` is False. Then the
     environment is absent until the worker is ready: the reset returns the last valid observation
@@ -71,404 +72,345 @@ class VectorEnv(SeededVector, ParallelEnv):
         *,
         workers: WorkerOptions = WorkerOptions(),  # noqa: B008 -- immutable
     ) -> None:
-        super().__init__(
-            num_workers,
-            create_env_fn,
-            mp_start_method=workers.start_method,
-            shutdown_timeout=5.0,
-            use_buffers=True,
-        )
+        super().__init__(num_workers, create_env_fn)
         missing = {keys.TRUNCATED, keys.FAULT} - {*self.done_keys, *self.observation_keys}
         if missing:
             raise ValueError(f"environments in workers need the entries {sorted(missing)}")
         self.workers, self.wait_for_restarts = workers, workers.wait_for_restarts
-        self._lost: set[int] = set()  # without an episode, and the next step reports a fault
-        self.parent_channels: list[Worker] = []
-        self._replacements = Replacements(
-            self.parent_channels, self._launch, self._close_all, workers.max_restarts, num_workers
-        )
-
-    @property
-    def restarts(self) -> int:
+        self.restarts = 0
         """Number of workers that were replaced."""
-        return self._replacements.restarts
+        self.shutdown_timeout = 5.0
+        """Seconds after which `close` kills a worker."""
+        self._workers: list[Worker] = []
+        self._starts: dict[int, int] = {}
+        """Numbers of failed attempts to start the workers that are not ready yet, by index."""
+        self._lost: set[int] = set()
+        """Indices of environments that must be reset, because their worker was replaced."""
+        self._failures_in_a_row = [0] * num_workers
+        self._replaced_since_seed = [0] * num_workers
 
     @property
     def worker_pids(self) -> list[int]:
         """Process ids of the workers, by environment."""
-        return [worker.process.pid for worker in self.parent_channels]
+        return [worker.process.pid for worker in self._workers]
 
-    def get_positions(self) -> list[Position]:
-        """Return the position of each environment; see `SeededVector.get_positions`."""
-        if self._lost:
-            raise WorkerError(f"the episodes of environments {sorted(self._lost)} are lost")
-        arguments = [()] * self.num_workers
-        return ask_all(self.parent_channels, "get_position", arguments, self.workers.timeout_s)
+    def start(self) -> None:
+        """Start the workers, and wait until all environments are made.
 
-    def continue_from(self, positions: Sequence[Position]) -> None:
-        """Continue episodes; see `SeededVector.continue_from`."""
-        steps = max(sum(map(len, position["actions"])) for position in positions)
-        arguments = [(position,) for position in positions]
-        self._replacements.finish(wait_for_all=True)
-        timeout_s = self.workers.timeout_s + steps * _STEP_S
-        ask_all(self.parent_channels, "continue_from", arguments, timeout_s)
-
-    def step_and_maybe_reset(
-        self, tensordict: TensorDictBase
-    ) -> tuple[TensorDictBase, TensorDictBase]:
-        """Step, and reset the environments that are done; see `EnvBase.step_and_maybe_reset`."""
-        self._check_actions(tensordict)
-        with self._stepping():
-            step, state = super().step_and_maybe_reset(tensordict)
-        if self._has_instruction:
-            self._write_instructions(step[keys.NEXT])
-            self._read_instructions(step[keys.NEXT, keys.DONE])
-            self._write_instructions(state)
-        return step, state
-
-    def close(self, *, raise_if_closed: bool = True) -> None:
-        """End the workers, and keep the number of torch threads, which TorchRL increases."""
-        threads = torch.get_num_threads()
-        super().close(raise_if_closed=raise_if_closed)
-        torch.set_num_threads(threads)
-
-    def __getitem__(self, item: Any) -> EnvBase:
-        raise NotImplementedError("a VectorEnv cannot be indexed: its workers may be replaced")
-
-    def _step(self, tensordict: TensorDictBase) -> TensorDictBase:
-        self._check_actions(tensordict)
-        with self._stepping():
-            return self._write_instructions(super()._step(tensordict))
-
-    def _reset(self, tensordict: TensorDictBase | None = None, **kwargs: Any) -> TensorDictBase:
-        if self.is_closed:
-            self.start()
-        self._replace_dead()
-        mask = None if tensordict is None else tensordict.get("_reset", None)
-        if mask is None or kwargs:
-            with self._waiting():
-                self._replacements.finish(wait_for_all=True)
-                state = super()._reset(tensordict, **kwargs)
-                self._read_instructions(mask)
-                return self._write_instructions(state)
-        self._replacements.finish(wait_for_all=self.wait_for_restarts)
-        if not mask.any():  # TorchRL would fail
-            state = self.shared_tensordict_parent.select(*self._selected_reset_keys_filt).clone()
-            return self._write_instructions(state)
-        with self._muted(self._replacements.starting):
-            state = super()._reset(tensordict, **kwargs)
-        self._read_instructions(mask)
-        return self._write_instructions(state)
-
-    def _create_td(self) -> None:
-        """Make the shared memory, which holds tensors only.
-
-        The instruction of an episode is asked of the worker after each reset instead.
+        Raises:
+            RuntimeError: an environment cannot be made, or a worker failed too often.
         """
-        super()._create_td()
-        self._has_instruction = keys.INSTRUCTION in self._non_tensor_keys
-        self._instructions = [""] * self.num_workers
-        if others := set(self._non_tensor_keys) - {keys.INSTRUCTION}:
-            raise ValueError(f"workers cannot share {sorted(others)}, which are no tensors")
-        self._non_tensor_keys = []
-
-    def _read_instructions(self, is_reset: torch.Tensor | None) -> None:
-        """Ask workers for the instructions of new episodes; one that has failed keeps its last.
-
-        Args:
-            is_reset: bool [num_workers, 1]; None for all.
-        """
-        if not self._has_instruction:
-            return
-        for index, worker in enumerate(self.parent_channels):
-            is_new = is_reset is None or bool(is_reset[index].any())
-            if is_new and index not in self._replacements.starting:
-                with contextlib.suppress(WorkerError):
-                    (self._instructions[index],) = ask_all(
-                        [worker], keys.INSTRUCTION, [()], self.workers.timeout_s
-                    )
-
-    def _write_instructions(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Set the instructions of the present episodes, if they are observed."""
-        if self._has_instruction:
-            tensordict.set(keys.INSTRUCTION, NonTensorStack(*self._instructions))
-        return tensordict
-
-    def _seed_env(self, index: int, seed: int) -> None:
-        self._replacements.on_seed(index)
-        self._replacements.finish(wait_for_all=True)
-        worker = self.parent_channels[index]
-        try:
-            worker.check()
-            seed_worker(worker, seed)
-        except WorkerError as error:
-            self._replacements.begin({index: error}, seed)
-            self._replacements.finish(wait_for_all=True)
-            self._lost.add(index)
-
-    def _set_base_seed(self, seed: int | None) -> None:
-        super()._set_base_seed(seed)
-        self._replacements.base_seed = self._base_seed
-
-    def _start_workers(self) -> None:
-        # TorchRL raises if a process in `_workers` has ended; here it is replaced instead.
-        self._workers: list[Any] = []
-        self._timeout = self.shutdown_timeout
-        self._shm_done_flags = mp.RawArray("b", self.num_workers)
-        self._lost.clear()
-        self.event = None  # TorchRL's CUDA event; these environments are on the CPU
+        outputs = _zeros(self.full_observation_spec, self.full_reward_spec, self.full_done_spec)
+        specs = self.observation_spec.items(True, True)
+        names = [key for key, spec in specs if isinstance(spec[0], NonTensor)]
+        self._texts = {key: [""] * self.num_workers for key in names}
+        self._last = outputs.exclude(*names)
+        self._rows = [dict(row.items(True, True)) for row in self._last.unbind(0)]
+        inputs = _zeros(self.full_action_spec, self.full_state_spec).share_memory_().unbind(0)
+        self._slots = list(zip(inputs, self._last.clone().share_memory_().unbind(0), strict=True))
+        self._lost, self._starts = set(), dict.fromkeys(range(self.num_workers), 0)
+        self._replaced_since_seed = [0] * self.num_workers
         try:
             for index in range(self.num_workers):
-                self.parent_channels.append(self._launch(index))
-            failures = {}
-            for index, worker in enumerate(self.parent_channels):
-                try:
-                    worker.wait_until_ready()
-                except EnvironmentRaisedError as error:
-                    raise RuntimeError(f"worker {index} could not be started: {error}") from None
-                except WorkerError as error:
-                    failures[index] = error
-            self._replacements.begin(failures, failures=1)
-            self._replacements.finish(wait_for_all=True)
+                self._workers.append(self._launch(index))
+            self._finish_starts(wait_for_all=True)
         except BaseException:
-            for worker in self.parent_channels:
-                worker.kill()
-            self._forget_workers()
+            self.close(raise_if_closed=False)
             raise
         self.is_closed = False
-        self.set_spec_lock_()
+
+    def continue_from(self, positions: Sequence[Position]) -> None:
+        """Continue episodes; see `Vector.continue_from`."""
+        steps = max(sum(map(len, position["actions"])) for position in positions)
+        commands = [("call", ("continue_from", position), {}) for position in positions]
+        self._ask_all(commands, self.workers.timeout_s + steps * _STEP_S)
+
+    def get_positions(self) -> list[Position]:
+        """Return the position of each environment; see `Vector.get_positions`."""
+        if self._lost:
+            raise WorkerError(f"the episodes of environments {sorted(self._lost)} are lost")
+        return super().get_positions()
+
+    def close(self, *, raise_if_closed: bool = True) -> None:
+        """End the workers."""
+        if self.is_closed and raise_if_closed:
+            raise RuntimeError("the environments are closed already")
+        for index, worker in enumerate(self._workers):
+            if index in self._starts:
+                worker.abort()
+            else:
+                worker.send("close", (), {})
+        deadline = time.monotonic() + self.shutdown_timeout
+        for worker in self._workers:
+            worker.join(deadline - time.monotonic())
+        self._workers, self._starts = [], {}
+        super().close()
+
+    def __reduce_ex__(self, protocol: SupportsIndex) -> tuple[Any, ...]:
+        if self.is_closed:
+            return super().__reduce_ex__(protocol)
+        raise TypeError(
+            "the processes of a vector cannot be copied: copy one with parallel=False, let another "
+            "vector continue the episodes, other.continue_from(envs.get_positions()), or use "
+            "get_state and set_state of a single environment"
+        )
+
+    # -- commands ----------------------------------------------------------------------------
+
+    def _reset_some(self, options: Mapping[int, dict[str, Any]], *, is_full: bool) -> None:
+        self._start_or_replace_dead()
+        remaining = set(options)
+        while remaining:
+            self._finish_starts(wait_for_all=is_full or self.wait_for_restarts)
+            absent = remaining & self._starts.keys()
+            answers, failures = self._ask(
+                {index: ("reset", (), options[index]) for index in remaining - absent}
+            )
+            for index, texts in answers.items():
+                self._read(index, texts)
+                self._lost.discard(index)
+            for index in absent:
+                self._write(index, _ABSENT)
+            self._replace_failed(failures)
+            remaining = set(failures)
+
+    def _step_some(self, indices: Sequence[int], inputs: TensorDictBase) -> None:
+        self._start_or_replace_dead()
+        present = [index for index in indices if index not in self._lost]
+        for key in self._slots[0][0].keys(True, True):
+            for index in present:
+                self._slots[index][0].get(key).copy_(inputs.get(key)[index])
+        answers, failures = self._ask({index: ("step", (), {}) for index in present})
+        for index, texts in answers.items():
+            self._read(index, texts)
+            self._failures_in_a_row[index] = 0
+        self._replace_failed(failures)
+        self._finish_starts(wait_for_all=self.wait_for_restarts)
+        if len(self._starts) == self.num_workers:
+            wait([worker.pipe for worker in self._workers], _START_POLL_S)
+        for index in self._lost.intersection(indices):
+            self._write(index, _LOST_STEP)
+
+    def _outputs(self) -> TensorDict:
+        outputs = self._last.clone()
+        for key, texts in self._texts.items():
+            outputs.set(key, NonTensorStack(*texts))
+        return outputs
+
+    def _seed_one(self, index: int, seed: int | None, static_seed: bool) -> int | None:
+        self._start_or_replace_dead()
+        while True:
+            self._finish_starts(wait_for_all=True)
+            self._replaced_since_seed[index] = 0
+            answers, failures = self._ask({index: ("set_seed", (seed, static_seed), {})})
+            if not failures:
+                return answers[index]
+            self._replace_failed(failures)
+
+    def _call_each(
+        self, method: str, arguments: Iterable[tuple[Any, ...]], **keywords: Any
+    ) -> list[Any]:
+        return self._ask_all([("call", (method, *own), keywords) for own in arguments])
+
+    def _get_each(self, name: str) -> tuple[list[Any], bool]:
+        answers = self._ask_all([("get", (name,), {})] * self.num_workers)
+        return [value for value, _ in answers], answers[0][1]
+
+    def _ask_all(self, commands: Sequence[Command], timeout_s: float | None = None) -> list[Any]:
+        """Return the answer of each worker.
+
+        Raises:
+            WorkerError: a worker has failed.
+            Exception: an environment raised it.
+        """
+        if self.is_closed:
+            self.start()
+        self._finish_starts(wait_for_all=True)
+        answers, failures = self._ask(dict(enumerate(commands)), timeout_s)
+        for index, cause in failures.items():
+            raise WorkerError(f"worker {index} failed: {cause}")
+        return [answers[index] for index in range(self.num_workers)]
+
+    def _ask(
+        self, commands: Mapping[int, Command], timeout_s: float | None = None
+    ) -> tuple[dict[int, Any], dict[int, WorkerError]]:
+        """Send commands to workers and wait for the answers.
+
+        Args:
+            commands: by index of the worker.
+            timeout_s: seconds to wait; by default that of the options.
+
+        Returns:
+            The answers, and the errors of the workers that failed, which are killed; by index.
+
+        Raises:
+            Exception: an environment raised it; see `is_of_code`.
+        """
+        timeout_s = self.workers.timeout_s if timeout_s is None else timeout_s
+        for index, command in commands.items():
+            self._workers[index].send(*command)
+        pending, answers, failures, raised = set(commands), {}, {}, None
+        deadline = time.monotonic() + timeout_s
+        try:
+            while pending:
+                handles = [handle for i in pending for handle in self._workers[i].handles]
+                is_late = not _wait(handles, deadline - time.monotonic())
+                for index in sorted(pending):
+                    worker = self._workers[index]
+                    try:
+                        if worker.has_answer():
+                            answers[index] = worker.receive()
+                        elif is_late:
+                            raise WorkerError(f"it did not answer within {timeout_s:g} s")
+                        else:
+                            continue
+                    except WorkerError as error:
+                        failures[index] = error
+                        worker.abort()
+                    except Exception as error:  # of the environment
+                        raised = error
+                    pending.discard(index)
+        finally:  # after an interrupt, a late answer would be taken for that to the next command
+            for index in pending:
+                self._workers[index].abort()
+        if raised is not None:
+            raise raised
+        return answers, failures
+
+    def _read(self, index: int, texts: dict[str, Any]) -> None:
+        """Copy the answer of a worker from shared memory, into which it writes again later."""
+        for key, value in self._slots[index][1].items(True, True):
+            self._rows[index][key].copy_(value)
+        for key, text in texts.items():
+            self._texts[key][index] = text
+
+    def _write(self, index: int, values: Mapping[str, Any]) -> None:
+        """Set the flags of an environment without an episode; it keeps its last observation."""
+        for key in values.keys() & self._rows[index].keys():
+            self._rows[index][key].fill_(values[key])
+
+    # -- workers -----------------------------------------------------------------------------
 
     def _launch(self, index: int) -> Worker:
         """Start worker ``index`` without waiting for it."""
         make_env = self.create_env_fn[index]
-        if not isinstance(make_env, EnvCreator | CloudpickleWrapper):
+        if not isinstance(make_env, EnvCreator):
             make_env = CloudpickleWrapper(make_env)
-        self._shm_done_flags[index] = 0
-        options = {
-            "env_fun": make_env,
-            "env_fun_kwargs": self.create_env_kwargs[index],
-            "num_threads": self.num_sub_threads,
-            "filter_warnings": self._filter_warnings_subprocess(),
-            "worker_idx": index,
-            "shm_done_flags": self._shm_done_flags,
-            "shared_tensordict": self.shared_tensordicts[index],
-            "_selected_input_keys": self._selected_input_keys,
-            "_selected_reset_keys": self._selected_reset_keys,
-            "_selected_step_keys": self._selected_step_keys,
-            "_non_tensor_keys": self._non_tensor_keys,
-        }
-        limits = self._mp_start_method, self.workers.timeout_s, self.workers.start_timeout_s
-        return Worker(_run_worker_pipe_shared_mem, options, *limits)
+        return Worker(make_env, self._slots[index], self.workers)
 
-    @property
-    def _events(self) -> list[Any]:
-        return [worker.event for worker in self.parent_channels]
-
-    def _shutdown_workers(self) -> None:
-        for index, worker in enumerate(self.parent_channels):
-            if index in self._replacements.starting:
-                worker.abort()
-                continue
-            worker.muted = False
-            worker.send(("close", None))
-        deadline = time.monotonic() + self.shutdown_timeout
-        for worker in self.parent_channels:
-            worker.join(deadline - time.monotonic())
-        self._forget_workers()
-        del self.shared_tensordicts, self.shared_tensordict_parent
-        del self._shared_tensordict_parent_next, self._shared_tensordict_parent_root
-
-    def _forget_workers(self) -> None:
-        self.parent_channels.clear()
-        self._replacements.forget_starts()
-
-    def _close_all(self) -> None:
-        if not self.is_closed:  # else `_start_workers` ends them
-            self.close()
-
-    @contextlib.contextmanager
-    def _stepping(self) -> Iterator[None]:
-        """Context of a step: workers that ended since the last command report a fault."""
+    def _start_or_replace_dead(self) -> None:
+        """Start all workers if there are none; otherwise replace those that have ended."""
         if self.is_closed:
             self.start()
-        self._replace_dead()
-        with self._muted(self._lost):
-            yield
-
-    @contextlib.contextmanager
-    def _muted(self, indices: Iterable[int]) -> Iterator[None]:
-        """Context in which some workers get no commands."""
-        for index in indices:
-            self.parent_channels[index].muted = True
-        try:
-            yield
-        finally:
-            for worker in self.parent_channels:
-                worker.muted = False
-
-    @contextlib.contextmanager
-    def _waiting(self) -> Iterator[None]:
-        """Context in which resets wait for workers that start."""
-        waits, self.wait_for_restarts = self.wait_for_restarts, True
-        try:
-            yield
-        finally:
-            self.wait_for_restarts = waits
-
-    def _replace_dead(self) -> None:
-        """Replace the workers that have ended since their last answer."""
         dead = {}
-        for index, worker in enumerate(self.parent_channels):
-            if not worker.is_ready:
-                continue
+        for index, worker in enumerate(self._workers):
             try:
-                worker.check()
+                if index not in self._starts:
+                    worker.check()
             except WorkerError as error:
                 dead[index] = error
-        self._replacements.begin(dead)
-        self._lost |= dead.keys()
+        self._replace(dead)
 
-    def _wait_for_workers(self, workers_range: Iterable[int]) -> None:
-        messages = {index: self.parent_channels[index].message for index in workers_range}
-        absent = {index for index in messages if self.parent_channels[index].muted}
-        for index in absent:
-            self.parent_channels[index].muted = False
-        failures = self._collect([index for index in messages if index not in absent])
-        answered = messages.keys() - absent - failures.keys()
-        for index in answered:
-            self._lost.discard(index)
-            if messages[index][0] != "reset":
-                self._replacements.count_step(index)
-        self._replace_failed(failures)
-        if len(self._replacements.starting) == self.num_workers:
-            self._replacements.wait_for_any(_START_POLL_S)
-            self._replacements.finish(wait_for_all=False)
-        for index in sorted(messages.keys() - answered):
-            self._recover(index, messages[index])
+    def _replace_failed(self, failures: Mapping[int, WorkerError]) -> None:
+        """Count failures in resets and steps, and replace the workers."""
+        for index, cause in sorted(failures.items()):
+            self._failures_in_a_row[index] += 1
+            self._check_limit(index, self._failures_in_a_row[index], "completing a step", cause)
+        self._replace(failures)
 
-    def _replace_failed(self, failures: dict[int, WorkerError]) -> None:
-        for index, cause in failures.items():
-            self._replacements.count_failure(index, cause)
-        self._replacements.begin(failures)
-        self._replacements.finish(wait_for_all=self.wait_for_restarts)
-
-    def _collect(self, indices: list[int]) -> dict[int, WorkerError]:
-        """Wait for the answers of workers; return the errors of failed workers by index."""
-        pending = set(indices)
-        failures: dict[int, WorkerError] = {}
-        deadline = time.monotonic() + self.workers.timeout_s
-        try:
-            while pending:
-                failed = collect_flags(self.parent_channels, pending, self._shm_done_flags)
-                if time.monotonic() > deadline:
-                    late = f"it did not finish within {self.workers.timeout_s:g} s"
-                    failed = {index: WorkerError(late) for index in pending} | failed
-                failures |= failed
-                pending -= failed.keys()
-        except BaseException:
-            # After an interrupt, a late answer would be taken for the answer to the next command.
-            for index in pending:
-                self.parent_channels[index].abort()
-            raise
-        return failures
-
-    def _recover(self, index: int, message: tuple[Any, Any]) -> None:
-        """Answer the command in ``message`` for an environment that lost its episode."""
-        command = message[0]
-        self._lost.add(index)
-        if command != "reset":
-            self._write(index, _LOST_STEP, to_next=True)
-            message = ("reset", (False, {}))
-        if command == "step":  # the environment is done, so the caller resets it
-            if index not in self._replacements.starting:
-                self._lost.discard(index)
-            return
-        while index not in self._replacements.starting:
-            # The message contains the seed, if the caller gave one.
-            self.parent_channels[index].send(message)
-            failures = self._collect([index])
-            if not failures:
-                self._lost.discard(index)
-                return
-            self._replace_failed(failures)
-        self._write(index, _ABSENT, to_next=False)
-
-    def _write(self, index: int, values: dict[str, Any], *, to_next: bool) -> None:
-        """Write the answer of an environment without a worker: its last observation, and flags.
+    def _replace(self, causes: Mapping[int, WorkerError], attempts: int = 0) -> None:
+        """Start new processes in place of failed workers, without waiting for them.
 
         Args:
-            index: of the environment.
-            values: of the flags and the reward.
-            to_next: answer a step, otherwise a reset.
+            causes: why each worker is replaced, by index.
+            attempts: number of failed attempts to start the worker.
+
+        Raises:
+            RuntimeError: there were too many.
         """
-        root = self.shared_tensordicts[index]
-        answer = root
-        if to_next:
-            answer = root.get("next")
-            for key in set(self.observation_keys) - {keys.INSTRUCTION}:
-                answer.get(key).copy_(root.get(key))
-        for key in values.keys() & set(answer.keys()):
-            answer.get(key).fill_(values[key])
+        for index, cause in causes.items():
+            self._check_limit(index, attempts, "starting", cause)
+            self.restarts += 1
+            # As text: the traceback in a stored log record would keep the ended worker alive.
+            logger.warning(
+                "worker %d is replaced (restart %d): %s", index, self.restarts, str(cause)
+            )
+            self._workers[index].kill()
+            self._workers[index] = self._launch(index)
+            self._starts[index] = attempts
+            self._replaced_since_seed[index] += 1
+            self._lost.add(index)
+
+    def _finish_starts(self, *, wait_for_all: bool) -> None:
+        """Seed the environments of the new workers that are ready; they must be reset.
+
+        Args:
+            wait_for_all: wait until every worker is ready.
+
+        Raises:
+            RuntimeError: too many attempts to start a worker failed.
+            ConfigError: the constructor of an environment raised it.
+        """
+        is_any = True
+        while self._starts and (wait_for_all or is_any):
+            is_any = False
+            for index, attempts in tuple(self._starts.items()):
+                worker = self._workers[index]
+                if not (wait_for_all or worker.has_started_or_failed()):
+                    continue
+                is_any = True
+                try:
+                    worker.wait_until_ready()
+                    del self._starts[index]
+                    if self._replaced_since_seed[index]:
+                        _, failures = self._ask(
+                            {index: ("set_seed", (self._new_seed(index), True), {})}
+                        )
+                        self._replace(failures, attempts + 1)
+                except ConfigError:
+                    worker.abort()  # its answer is read
+                    raise
+                except WorkerError as error:
+                    if self.is_closed and isinstance(error, EnvironmentRaisedError):
+                        raise RuntimeError(
+                            f"worker {index} could not be started: {error}"
+                        ) from None
+                    self._replace({index: error}, attempts + 1)
+
+    def _new_seed(self, index: int) -> int:
+        """Return an unused seed, which is the same in every repetition of the run."""
+        known = self._base_seed is not None
+        entropy = [self._base_seed, index, self._replaced_since_seed[index]] if known else None
+        return int(np.random.SeedSequence(entropy).generate_state(1)[0])
+
+    def _check_limit(self, index: int, failures: int, success: str, cause: WorkerError) -> None:
+        if failures <= self.workers.max_restarts:
+            return
+        self.close(raise_if_closed=False)
+        raise RuntimeError(
+            f"worker {index} failed {failures} times without {success}; the last time {cause}. All "
+            "workers were closed. Use parallel=False to see the error where it happens, or raise "
+            "timeout_s, start_timeout_s or max_restarts"
+        )
 
 
-def collect_flags(
-    workers: Sequence[Worker], pending: set[int], flags: Array[c_byte]
-) -> dict[int, WorkerError]:
-    """Wait briefly for the workers' answers, which are in shared memory.
+def _wait(handles: Sequence[Connection | int], timeout_s: float) -> bool:
+    """Wait until a handle is ready; return False after the timeout.
 
-    Args:
-        workers: all workers.
-        pending: indices of those that have not answered; those that answer are removed.
-        flags: set by the workers.
-
-    Returns:
-        The errors of ended workers, by index.
+    First it polls: on a machine whose cores are busy, a process that blocks continues later.
     """
-
-    def all_answered() -> bool:
-        for index in tuple(pending):
-            if flags[index]:
-                flags[index] = 0
-                pending.discard(index)
-        return not pending
-
-    failures: dict[int, WorkerError] = {}
-    if wait_until(all_answered, _HEALTH_CHECK_S):
-        return failures
-    for index in pending:
-        try:
-            workers[index].check()
-        except WorkerError as error:
-            if not flags[index]:  # else it answered before it ended
-                failures[index] = error
-    return failures
+    start = time.monotonic()
+    while not wait(handles, 0):
+        elapsed_s = time.monotonic() - start
+        if elapsed_s > min(timeout_s, _POLLING_S):
+            return bool(wait(handles, max(timeout_s - elapsed_s, 0.0)))
+        time.sleep(_POLL_INTERVAL_S)
+    return True
 
 
-def ask_all(
-    workers: Sequence[Worker], method: str, arguments: Sequence[tuple[Any, ...]], timeout_s: float
-) -> list[Any]:
-    """Call a method of every worker's environment and return the results.
-
-    Args:
-        workers: all workers.
-        method: name of the method.
-        arguments: of each worker's call.
-        timeout_s: seconds to wait for each answer.
-
-    Raises:
-        WorkerError: a worker has failed.
-        Exception: an environment raised it.
-    """
-    for worker, args in zip(workers, arguments, strict=True):
-        worker.check()
-        worker.send((method, (args, {})))
-    results, failure = [], None
-    for worker in workers:
-        try:
-            results.append(worker.read(timeout_s)[1])
-        except Exception as error:
-            worker.abort()  # a late answer would be taken for that to the next command
-            failure = error
-    if failure is not None:
-        raise failure
-    return results
+def _zeros(*specs: Composite) -> TensorDictBase:
+    """Return zeros [num_workers] for the entries of specs, dense if the environments are alike."""
+    zeros = specs[0].zero()
+    for spec in specs[1:]:
+        zeros.update(spec.zero())
+    return TensorDict.maybe_dense_stack(zeros.cpu().unbind(0))

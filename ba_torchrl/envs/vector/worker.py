@@ -1,10 +1,8 @@
-"""The parent process's handle of a worker process of a vector of environments."""
+"""A process that runs one environment of a vector, and the parent's handle of it."""
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
-import logging
 import os
 import pickle
 import signal
@@ -12,27 +10,28 @@ import sys
 import threading
 import time
 import traceback
-from collections.abc import Callable
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from functools import cache
 from multiprocessing import util
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
-from queue import SimpleQueue
 from typing import Any, NamedTuple
 
-import torchrl
+import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import multiprocessing as mp
+from torchrl.data import NonTensor
 from typing_extensions import Self
 
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.batching import MakeEnv
 from ba_torchrl.errors import ConfigError, WorkerError
 from ba_torchrl.sim.world import SIMULATOR_ERRORS
 
-logger = logging.getLogger(__name__)
+Slot = tuple[TensorDictBase, TensorDictBase]
 
-_IDLE_TIMEOUT_S = 1e6  # by default TorchRL's workers end after 10,000 s without a command
 _PR_SET_PDEATHSIG = 1
-_BUSY_WAIT_S = 100e-6
-_POLL_INTERVAL_S = 30e-6
 
 
 class EnvironmentRaisedError(WorkerError):
@@ -87,140 +86,99 @@ def is_of_code(error: Exception) -> bool:
 
 
 class Worker:
-    """A process that runs one of TorchRL's worker loops, and the pipe to it.
+    """The parent's handle of a process that runs one environment.
 
-    It has the interface of a pipe, which TorchRL expects, and stores the last command. Reading from
-    a broken pipe raises a `WorkerError`.
+    A command is the name of a method of `_Member` and its arguments, as bytes in a pipe, and has
+    one answer. Observations, rewards and flags are in shared memory.
 
     Args:
-        loop: TorchRL's worker loop.
-        options: keyword arguments of ``loop``, except the two ends of the pipe and the event.
-        start_method: "spawn" or "fork"; None for the default of this process.
-        timeout_s: seconds to wait for an answer.
-        start_timeout_s: seconds to wait until the environment is built.
+        make_env: builds the environment.
+        slot: TensorDicts in shared memory: action and state; observation, reward and flags.
+        options: how the process starts, and its time limits.
     """
 
-    def __init__(
-        self,
-        loop: Callable[..., None],
-        options: dict[str, Any],
-        start_method: str | None,
-        timeout_s: float,
-        start_timeout_s: float,
-    ) -> None:
-        context = mp.get_context(start_method)
+    def __init__(self, make_env: MakeEnv, slot: Slot, options: WorkerOptions) -> None:
+        context = mp.get_context(options.start_method)
         self.pipe, child_pipe = context.Pipe()
-        self.event = context.Event()
-        self.message: tuple[Any, Any] = ("start", None)
-        self.muted = False  # commands are dropped, because the episode is lost
-        self._timeout_s, self._start_timeout_s = timeout_s, start_timeout_s
-        options = {
-            **options,
-            "parent_pipe": self.pipe,
-            "child_pipe": child_pipe,
-            "mp_event": self.event,
-        }
-        self.is_ready = False
-        """Whether the environment is built, and the worker takes commands."""
         self.process = context.Process(
-            target=_run_worker, args=(loop, options, os.getpid()), daemon=True
+            # A function that cannot be imported is met first, so that the pipe is open until the
+            # process has ended.
+            target=_run,
+            args=(make_env, slot, child_pipe, self.pipe, os.getpid()),
+            daemon=True,
         )
         start_process(self.process)
-        self._start_deadline = time.monotonic() + start_timeout_s
+        child_pipe.close()  # else the pipe stays open when the process ends
+        self._start_timeout_s = options.start_timeout_s
+        self._start_deadline = time.monotonic() + options.start_timeout_s
+        self._is_ready = False
         # At the end of this process, before multiprocessing sends SIGTERM, which workers ignore.
         self._at_exit = util.Finalize(self, _kill, (self.process,), exitpriority=10)
-        child_pipe.close()  # else the pipe stays open when the worker ends
-
-    @property
-    def command(self) -> str:
-        """The name of the last command."""
-        return self.message[0]
+        self.send("make", (), {})
 
     def has_started_or_failed(self) -> bool:
         """Whether `wait_until_ready` returns or raises at once."""
-        is_late = time.monotonic() > self._start_deadline
-        return is_late or self.process.exitcode is not None or self.pipe.poll()
+        return time.monotonic() > self._start_deadline or self.has_answer()
 
     def wait_until_ready(self) -> None:
-        """Wait until the environment is built.
+        """Wait until the environment is made.
 
         Raises:
-            WorkerError: the environment is not built within ``start_timeout_s`` seconds after the
-                start, or the process has ended.
-            EnvironmentRaisedError: its constructor raised.
+            WorkerError: it is not made within ``start_timeout_s`` seconds after the start, or the
+                process has ended.
+            EnvironmentRaisedError: its constructor raised, or what it needs cannot be imported.
+            ConfigError: its constructor raised it; in a new process it would again.
         """
-        left_s = max(self._start_deadline - time.monotonic(), 0.0)
-        self.read(left_s, limit_s=self._start_timeout_s)
-        self.is_ready = True
-        self.send(("init", None))
+        if not self.pipe.poll(max(self._start_deadline - time.monotonic(), 0.0)):
+            raise WorkerError(f"it did not start within {self._start_timeout_s:g} s")
+        self.receive()
+        self._is_ready = True
 
-    def send(self, message: tuple[Any, Any]) -> None:
-        """Send a command and its argument; if the worker has ended, reading the answer raises.
+    @property
+    def handles(self) -> tuple[Connection, int]:
+        """What `multiprocessing.connection.wait` waits for: an answer, the end of the process."""
+        return self.pipe, self.process.sentinel
 
-        Raises:
-            WorkerError: the environment is not built yet.
-        """
-        self.message = message
-        if self.muted:
-            return
-        if not self.is_ready:
-            raise WorkerError(f"it cannot take {self.command!r} while it starts")
-        try:
+    def send(self, command: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> None:
+        """Send a command; if the process has ended, `receive` raises."""
+        with suppress(OSError):
             # Not `send`, which passes tensors as file descriptors that an ended worker never opens.
-            self.pipe.send_bytes(pickle.dumps(message, pickle.HIGHEST_PROTOCOL))
-        except OSError as error:
-            logger.debug("could not send %r: %s", message[0], error)
+            self.pipe.send_bytes(pickle.dumps((command, arguments, keywords)))
 
-    def recv(self) -> Any:
-        """Return the next answer.
+    def has_answer(self) -> bool:
+        """Whether `receive` returns or raises at once."""
+        return self.pipe.poll() or self.process.exitcode is not None
 
-        Raises:
-            WorkerError: the worker failed.
-        """
-        return self.read(self._timeout_s)
-
-    def read(self, timeout_s: float, *, limit_s: float | None = None) -> Any:
-        """Return the next message of the pipe.
-
-        Args:
-            timeout_s: seconds to wait.
-            limit_s: the limit that the error names; by default ``timeout_s``.
+    def receive(self) -> Any:
+        """Return the answer to the last command, which has arrived.
 
         Raises:
-            WorkerError: the worker has ended, or sends nothing for ``timeout_s`` seconds.
+            WorkerError: the process has ended.
             EnvironmentRaisedError: the simulator or the machine failed, or the environment cannot
                 be made.
             Exception: any other error of the environment, with its traceback as the cause; in a new
                 process it would occur again.
         """
         try:
-            if not self.pipe.poll(timeout_s):
-                limit_s = timeout_s if limit_s is None else limit_s
-                raise WorkerError(f"it did not answer {self.command!r} within {limit_s:g} s")
-            message = self.pipe.recv()
+            if not self.pipe.poll():
+                raise EOFError
+            answer = pickle.loads(self.pipe.recv_bytes())
         except (EOFError, OSError):
-            reason = self._exit_reason()
-            # `_run_worker` sends every exception: this one was raised before, by an import
-            if not self.is_ready and (self.process.exitcode or 0) > 0:
-                raise EnvironmentRaisedError(
-                    f"{reason} before it made the environment. It cannot import what it needs, see "
-                    'its traceback above, or the script lacks `if __name__ == "__main__":`'
-                ) from None
-            raise WorkerError(reason) from None
-        if isinstance(message, SentError):
-            error = message.received()
-            is_final = isinstance(error, ConfigError) or (self.is_ready and is_of_code(error))
+            self._raise_exit()
+        if isinstance(answer, SentError):
+            error = answer.received()
+            is_final = isinstance(error, ConfigError) or (self._is_ready and is_of_code(error))
             raise error if is_final else error.__cause__
-        return message
+        return answer
 
     def check(self) -> None:
-        """Drop answers to earlier commands, and check that the worker runs.
+        """Check that the process runs.
 
         Raises:
-            WorkerError: the worker has ended.
+            WorkerError: it has ended.
         """
-        while self.process.exitcode is not None or self.pipe.poll():
-            self.read(0.0)
+        if self.process.exitcode is not None:
+            self._raise_exit()
 
     def join(self, timeout_s: float) -> None:
         """Wait until the process ends, kill it after the timeout, and release its resources."""
@@ -229,8 +187,7 @@ class Worker:
 
     def abort(self) -> None:
         """Kill the process; the next `check` raises."""
-        self.process.kill()  # a hanging simulator ignores other signals
-        self.process.join()
+        _kill(self.process)  # a hanging simulator ignores other signals
 
     def kill(self) -> None:
         """Kill the process and release its resources."""
@@ -239,14 +196,100 @@ class Worker:
         self.process.close()
         self.pipe.close()
 
-    def _exit_reason(self) -> str:
+    def _raise_exit(self) -> None:
         self.process.join(1.0)
         code = self.process.exitcode
         if code is None:
-            return "it closed its pipe"
-        if code >= 0:
-            return f"its process ended with exit code {code}"
-        return f"its process was ended by {signal.Signals(-code).name}"
+            raise WorkerError("it closed its pipe")
+        if code < 0:
+            raise WorkerError(f"its process was ended by {signal.Signals(-code).name}")
+        reason = f"its process ended with exit code {code}"
+        if self._is_ready or code == 0:
+            raise WorkerError(reason)
+        raise EnvironmentRaisedError(  # not by the environment, whose errors are answers
+            f"{reason} before it made the environment. It cannot import what it needs, see its "
+            'traceback above, or the script lacks `if __name__ == "__main__":`'
+        )
+
+
+class _Member:
+    """The environment of a worker process. Its methods are the commands.
+
+    Args:
+        make_env: builds the environment.
+        slot: as for `Worker`.
+    """
+
+    def __init__(self, make_env: MakeEnv, slot: Slot) -> None:
+        self._make_env = make_env
+        self._inputs, self._outputs = (dict(part.items(True, True)) for part in slot)
+
+    def make(self) -> None:
+        """Build the environment."""
+        self.env = self._make_env()
+        self._state: TensorDictBase = TensorDict({}, self.env.batch_size)
+        spec = self.env.observation_spec
+        self._texts = [key for key in spec.keys(True, True) if isinstance(spec[key], NonTensor)]
+
+    def set_seed(self, seed: int | None, static_seed: bool) -> int | None:
+        """Seed the environment and torch."""
+        if seed is not None:
+            torch.manual_seed(seed)
+        return self.env.set_seed(seed, static_seed=static_seed)
+
+    def reset(self, **options: Any) -> dict[Any, Any]:
+        """Reset; return the entries that are no tensors."""
+        return self._write(self.env.reset(**options))
+
+    def step(self) -> dict[Any, Any]:
+        """Step with the action in shared memory; return the entries that are no tensors."""
+        state = self._state.copy()
+        for key, value in self._inputs.items():
+            state.set(key, value.clone())
+        return self._write(self.env.step(state)["next"])
+
+    def get(self, name: str) -> tuple[Any, bool]:
+        """Return an attribute of the environment and False, or None and True for a method."""
+        value = getattr(self.env, name)
+        return (None, True) if callable(value) else (value, False)
+
+    def call(self, method: str, *arguments: Any, **keywords: Any) -> Any:
+        """Call a method of the environment."""
+        return getattr(self.env, method)(*arguments, **keywords)
+
+    def close(self) -> None:
+        """Close the environment."""
+        self.env.close()
+
+    def _write(self, state: TensorDictBase) -> dict[Any, Any]:
+        self._state = state
+        for key, target in self._outputs.items():
+            value = state.get(key, None)
+            if value is not None:  # a reset has no reward
+                target.copy_(value)
+        return {key: state[key] for key in self._texts}
+
+
+def _run(
+    make_env: MakeEnv, slot: Slot, pipe: Connection, parent_pipe: Connection, parent: int
+) -> None:
+    """Execute commands in a worker process until it is closed or its parent has ended."""
+    end_with(parent)
+    # The parent handles the signals that a scheduler or a terminal sends to all processes, saves
+    # its state with the workers' help and ends them.
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, signal.SIG_IGN)
+    parent_pipe.close()
+    torch.set_num_threads(1)
+    member, command = _Member(make_env, slot), ""
+    with suppress(EOFError, OSError):
+        while command != "close":
+            command, arguments, keywords = pickle.loads(pipe.recv_bytes())
+            try:
+                answer = pickle.dumps(getattr(member, command)(*arguments, **keywords))
+            except BaseException as error:  # the parent raises it
+                answer = pickle.dumps(SentError.of(error))
+            pipe.send_bytes(answer)
 
 
 def _kill(process: BaseProcess) -> None:
@@ -266,35 +309,6 @@ def end_with(parent: int) -> None:
             os._exit(1)
 
 
-def _run_worker(loop: Callable[..., None], options: dict[str, Any], parent: int) -> None:
-    """Run TorchRL's loop in a worker process, and send its exception to the parent."""
-    end_with(parent)
-    # The parent handles the signals that a scheduler or a terminal sends to all processes, saves
-    # its state with the workers' help and ends them.
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, signal.SIG_IGN)
-    torchrl._utils.BATCHED_PIPE_TIMEOUT = _IDLE_TIMEOUT_S
-    pipe: Connection = options["child_pipe"]
-    try:
-        loop(**options)
-    except BaseException as error:
-        with contextlib.suppress(OSError):  # the parent has ended
-            pipe.send(SentError.of(error))
-        os._exit(1)  # skip the clean-up of the failed environment
-
-
-def wait_until(condition: Callable[[], bool], timeout_s: float) -> bool:
-    """Poll ``condition``, first by busy waiting; return whether it holds before the timeout."""
-    start = time.perf_counter()
-    while not condition():
-        elapsed = time.perf_counter() - start
-        if elapsed > timeout_s:
-            return False
-        if elapsed > _BUSY_WAIT_S:
-            time.sleep(_POLL_INTERVAL_S)  # free the core for the workers
-    return True
-
-
 def start_process(process: BaseProcess) -> None:
     """Start a worker process.
 
@@ -311,38 +325,15 @@ def start_process(process: BaseProcess) -> None:
     if threading.current_thread() is threading.main_thread():
         process.start()
         return
-    global _launcher
     with _lock:
-        if _launcher is None or not _launcher.is_alive():  # no thread survives a fork
-            _launcher = _Launcher()
-            _launcher.start()
-    _launcher.start_process(process)
+        launcher = _launcher(os.getpid())
+    launcher.submit(process.start).result()
 
 
-class _Launcher(threading.Thread):
-    """A thread that starts processes."""
-
-    def __init__(self) -> None:
-        super().__init__(name="worker launcher", daemon=True)
-        self._requests: SimpleQueue[tuple[BaseProcess, Future[None]]] = SimpleQueue()
-
-    def start_process(self, process: BaseProcess) -> None:
-        """Start a process in this thread, and wait until it is started."""
-        started: Future[None] = Future()
-        self._requests.put((process, started))
-        started.result()
-
-    def run(self) -> None:
-        """Serve requests until the process ends."""
-        while True:
-            process, started = self._requests.get()
-            try:
-                process.start()
-            except BaseException as error:  # raised in the thread that asked
-                started.set_exception(error)
-            else:
-                started.set_result(None)
+@cache
+def _launcher(pid: int) -> ThreadPoolExecutor:
+    """Return the thread that starts processes of this process ``pid``; none survives a fork."""
+    return ThreadPoolExecutor(1, "worker launcher")
 
 
-_launcher: _Launcher | None = None
 _lock = threading.Lock()

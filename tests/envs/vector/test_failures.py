@@ -165,13 +165,14 @@ class TestFailures:
     ):
         env = make_fakes(3, folder=tmp_path)
         state = act(env, env.reset())
-        (tmp_path / f"{env.worker_pids[1]}.{when}").write_text(order)
+        pids = env.worker_pids
+        (tmp_path / f"{pids[1]}.{when}").write_text(order)
         with pytest.raises(error, match=f"^{message}$") as raised:
             env.step(state) if when == "step" else env.reset()
         assert "in _misbehave" in str(raised.value.__cause__)  # the worker's traceback
-        assert env.restarts == 0
         state = env.reset()
         assert_stepped(env.step(act(env, state.clone())), 1, state)
+        assert (env.restarts, env.worker_pids) == (0, pids)
 
     def test_to_build_raise_with_the_cause(self, tmp_path):
         env = VectorEnv(
@@ -207,7 +208,7 @@ class TestFailures:
             raise KeyboardInterrupt
 
         with monkeypatch.context() as patch:
-            patch.setattr(parallel, "collect_flags", interrupt)
+            patch.setattr(parallel, "wait", interrupt)
             with pytest.raises(KeyboardInterrupt):
                 env.step(act(env, before.clone()))
         state = env.reset()

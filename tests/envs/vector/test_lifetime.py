@@ -10,10 +10,11 @@ from pathlib import Path
 import fake_env
 import pytest
 import torch
-from fake_env import act
+from fake_env import act, kill
 
 import ba_torchrl
 from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector import parallel
 from ba_torchrl.errors import ConfigError
 
 PARENT = """
@@ -112,8 +113,7 @@ def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes):
     state, lost = env.reset(), 0
     for number in range(8):
         # between two steps, in turn, and sooner than any completes one
-        os.kill(env.worker_pids[number % 2], signal.SIGKILL)
-        env.parent_channels[number % 2].process.join()
+        kill(env.worker_pids[number % 2])
         step, state = env.step_and_maybe_reset(act(env, state))
         lost += int(step["next", "fault"].sum())
     assert env.restarts == lost == 8
@@ -124,21 +124,22 @@ def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes):
 def test_workers_that_ended_together_start_together(make_fakes, monkeypatch):
     env = make_fakes(3)
     state = env.reset()
-    order, launch = [], env._replacements._launch
+    order = []
 
-    def recorded(index):
-        worker = launch(index)
-        ready = worker.wait_until_ready
-        worker.wait_until_ready = lambda: (order.append(f"wait {index}"), ready())
-        order.append(f"launch {index}")
-        return worker
+    class Recorded(parallel.Worker):
+        def __init__(self, *args):
+            super().__init__(*args)
+            order.append("launch")
 
-    monkeypatch.setattr(env._replacements, "_launch", recorded)
-    for worker in env.parent_channels[:2]:
-        os.kill(worker.process.pid, signal.SIGKILL)
-        worker.process.join()
+        def wait_until_ready(self):
+            order.append("wait")
+            super().wait_until_ready()
+
+    monkeypatch.setattr(parallel, "Worker", Recorded)
+    for pid in env.worker_pids[:2]:
+        kill(pid)
     env.step(act(env, state))
-    assert order == ["launch 0", "launch 1", "wait 0", "wait 1"]
+    assert order == ["launch", "launch", "wait", "wait"]
 
 
 def test_signals_for_all_processes_leave_the_workers_to_the_parent(make_fakes):

@@ -2,25 +2,19 @@
 
 import logging
 import multiprocessing
-import os
-import signal
 import time
 from functools import partial
 
 import pytest
 import torch
-from fake_env import FakeEnv, act, assert_lost, assert_stepped
+from fake_env import FakeEnv, act, assert_lost, assert_stepped, kill
 
 from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.errors import WorkerError
 
 METHODS = pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
-
-
-def kill(env, index):
-    os.kill(env.worker_pids[index], signal.SIGKILL)
-    env.parent_channels[index].process.join()
 
 
 def step_until(env, state, condition, seconds=20.0):
@@ -33,19 +27,19 @@ def step_until(env, state, condition, seconds=20.0):
     raise AssertionError(f"not within {seconds} s")
 
 
-def test_other_workers_step_before_a_start_is_awaited(make_fakes, tmp_path):
-    env = make_fakes(2, folder=tmp_path)
+def test_other_workers_step_before_a_start_is_awaited(make_fakes, monkeypatch):
+    env = make_fakes(2)
     state = env.reset()
-    kill(env, 0)
-    awaited, finish = [], env._replacements.finish
-
-    def record(*, wait_for_all):
-        awaited.append(env.parent_channels[1].command)
-        finish(wait_for_all=wait_for_all)
-
-    env._replacements.finish = record
+    kill(env.worker_pids[0])
+    order, receive = [], parallel.Worker.receive
+    monkeypatch.setattr(
+        parallel.Worker,
+        "receive",
+        lambda worker: (order.append(worker.process.pid), receive(worker))[1],
+    )
     result = env.step(act(env, state.clone()))
-    assert awaited == ["step"]
+    new, other = env.worker_pids
+    assert order[:2] == [other, new]
     assert_lost(result, 0, state)
     assert_stepped(result, 1, state)
 
@@ -56,7 +50,7 @@ def test_environments_are_absent_while_their_worker_starts(make_fakes, tmp_path,
     state = env.reset()
     (tmp_path / "build").write_text("wait")
     if how == "idle":
-        kill(env, 0)
+        kill(env.worker_pids[0])
     else:
         (tmp_path / f"{env.worker_pids[0]}.step").write_text("kill")
     before = state.clone()
@@ -81,7 +75,7 @@ def test_environments_are_absent_while_their_worker_starts(make_fakes, tmp_path,
 def test_a_full_reset_waits_for_workers_that_start(make_fakes, tmp_path):
     env = make_fakes(2, wait_for_restarts=False)
     expected = env.reset(seed=8)["pixels"]
-    kill(env, 1)
+    kill(env.worker_pids[1])
     state = env.reset(seed=8)
     assert torch.equal(state["pixels"], expected)
     assert not state["fault"].any()
@@ -91,8 +85,8 @@ def test_a_full_reset_waits_for_workers_that_start(make_fakes, tmp_path):
 def test_steps_go_on_when_every_worker_has_ended(make_fakes):
     env = make_fakes(2, wait_for_restarts=False)
     state = env.reset()
-    kill(env, 0)
-    kill(env, 1)
+    kill(env.worker_pids[0])
+    kill(env.worker_pids[1])
     step, state = env.step_and_maybe_reset(act(env, state))
     assert step["next", "fault"].all()
     step, _ = step_until(env, state, lambda step: not step["fault"].any())
@@ -103,7 +97,7 @@ def test_workers_that_start_end_with_the_environments(make_fakes, tmp_path):
     env = make_fakes(2, folder=tmp_path, wait_for_restarts=False)
     state = env.reset()
     (tmp_path / "build").write_text("wait")
-    kill(env, 0)
+    kill(env.worker_pids[0])
     env.step_and_maybe_reset(act(env, state))
     env.close()
     assert multiprocessing.active_children() == []
@@ -114,7 +108,7 @@ def test_deaths_at_the_start_of_a_restart_end_at_the_limit(make_fakes, tmp_path,
     env = make_fakes(2, folder=tmp_path, max_restarts=5, wait_for_restarts=waits)
     state = env.reset()
     (tmp_path / "build").write_text("kill")
-    kill(env, 0)
+    kill(env.worker_pids[0])
     with pytest.raises(RuntimeError, match=r"worker 0 failed 6 times without starting.*SIGKILL"):
         step_until(env, state, lambda step: False)
     assert env.is_closed
@@ -122,23 +116,23 @@ def test_deaths_at_the_start_of_a_restart_end_at_the_limit(make_fakes, tmp_path,
     assert multiprocessing.active_children() == []
 
 
-def test_a_restart_that_succeeds_resets_the_count(make_fakes, tmp_path, caplog):
+def test_a_restart_that_succeeds_resets_the_count(make_fakes, tmp_path, caplog, monkeypatch):
     env = make_fakes(1, folder=tmp_path, max_restarts=2)
     state = env.reset()
-    launch, attempts = env._replacements._launch, []
+    attempts = []
 
-    def fail_twice(index):
-        attempts.append(index)
-        (tmp_path / "build").write_text("kill")
-        if len(attempts) % 3 == 0:
-            (tmp_path / "build").unlink()
-        worker = launch(index)
-        worker.process.join(0.5)  # until it has read the file
-        return worker
+    class FailsTwice(parallel.Worker):
+        def __init__(self, *args):
+            attempts.append(self)
+            (tmp_path / "build").write_text("kill")
+            if len(attempts) % 3 == 0:
+                (tmp_path / "build").unlink()
+            super().__init__(*args)
+            self.process.join(0.5)  # until it has read the file
 
-    env._replacements._launch = fail_twice
+    monkeypatch.setattr(parallel, "Worker", FailsTwice)
     for _ in range(2):
-        kill(env, 0)
+        kill(env.worker_pids[0])
         with caplog.at_level(logging.CRITICAL):
             step, state = env.step_and_maybe_reset(act(env, state))
         assert step["next", "fault"].all()

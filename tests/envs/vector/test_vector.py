@@ -10,17 +10,16 @@ import pytest
 import torch
 from fake_env import FakeEnv, act, assert_lost, assert_stepped
 from torchrl.collectors import Collector
+from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 import ba_torchrl
 from ba_torchrl.config import WorkerOptions
-from ba_torchrl.envs.vector.make import (
-    SerialVectorEnv,
-    available_cores,
-    make_vector,
-)
+from ba_torchrl.envs.vector.batching import SerialVectorEnv
+from ba_torchrl.envs.vector.make import available_cores, make_vector
 from ba_torchrl.envs.vector.parallel import VectorEnv
 
 FORK = WorkerOptions(start_method="fork")
+SMALL = {"start_method": "fork", "obs_size": 16, "seed": 0}
 
 
 class TestSeeds:
@@ -35,9 +34,29 @@ class TestSeeds:
         expected = self.pixels(serial)
         assert torch.equal(self.pixels(parallel), expected)
         assert len(expected[:, 0].unique(dim=0)) == 3
-        assert serial.set_seed(8) == parallel.set_seed(8) == 11
-        assert torch.equal(self.pixels(serial), self.pixels(parallel))
         assert torch.equal(self.pixels(serial, seed=40), self.pixels(parallel, seed=40))
+
+    @pytest.mark.parametrize("parallel", [False, True])
+    @pytest.mark.parametrize("static", [False, True])
+    def test_are_set_as_by_torchrl(self, make_fakes, parallel, static):
+        env = make_fakes(3, parallel=parallel)
+        reference = SerialEnv(3, FakeEnv)
+        assert env.set_seed(8, static) == reference.set_seed(8, static_seed=static)
+        pixels = env.reset()["pixels"]
+        assert torch.equal(pixels, reference.reset()["pixels"])
+        assert len(pixels.unique(dim=0)) == (1 if static else 3)
+
+    @pytest.mark.parametrize("parallel", [False, True])
+    def test_none_is_a_random_one(self, parallel):
+        env = ba_torchrl.make_vector_env("close_loop/block_reaching", 2, parallel=parallel, **SMALL)
+        try:
+            seen = []
+            for _ in range(2):
+                assert env.set_seed(None) is None
+                seen.append(env.reset()["pixels"])
+            assert len(torch.cat(seen).unique(dim=0)) == 4
+        finally:
+            env.close()
 
     @pytest.mark.parametrize("parallel", [False, True])
     def test_environment_i_has_seed_plus_i(self, make_fakes, parallel):
@@ -45,8 +64,7 @@ class TestSeeds:
         at_start = env.reset()["pixels"]
         again = env.reset(seed=6)["pixels"]
         assert torch.equal(again[:2], at_start[1:])
-        env.set_seed(5)
-        assert torch.equal(env.reset()["pixels"], at_start)
+        assert torch.equal(env.reset(seed=5)["pixels"], at_start)
 
     @pytest.mark.parametrize("parallel", [False, True])
     def test_refuses_invalid_seeds(self, make_fakes, parallel):
@@ -132,7 +150,37 @@ class TestActions:
         assert env.step(act(env, env.reset(), 5.0))["next", "reward"].flatten().tolist() == [10, 10]
 
 
+def make_counting(horizon):
+    return TransformedEnv(FakeEnv(horizon=horizon), StepCounter(step_count_key="inner"))
+
+
 class TestWithTheRestOfTorchRL:
+    @pytest.mark.parametrize("parallel", [False, True])
+    def test_transforms_in_and_around_the_vector(self, parallel):
+        workers = WorkerOptions(parallel=parallel, start_method="fork")
+        factories = [partial(make_counting, horizon) for horizon in (2, 3)]
+        vector = make_vector(factories, 2, seed=0, workers=workers)
+        env = TransformedEnv(vector, StepCounter(step_count_key="outer"))
+        try:
+            check_env_specs(env, break_when_any_done="both", seed=0)
+            counts = env.rollout(4, break_when_any_done=False)["next"]
+            for key in ("step_count", "inner", "outer"):
+                assert counts[key].squeeze(-1).tolist() == [[1, 2, 1, 2], [1, 2, 3, 1]]
+        finally:
+            env.close()
+
+    @pytest.mark.parametrize("parallel", [False, True])
+    def test_attributes_and_methods_are_those_of_the_environments(self, parallel):
+        env = ba_torchrl.make_vector_env("close_loop/block_reaching", 2, parallel=parallel, **SMALL)
+        try:
+            env.reset()
+            assert env.max_steps == [50, 50]
+            shapes = [image.shape for image in env.render(width=8, height=4)]
+            assert shapes == [(4, 8, 3), (4, 8, 3)]
+            assert not hasattr(env, "no_such_name")
+        finally:
+            env.close()
+
     def test_a_collector_survives_a_kill(self, make_fakes):
         env = make_fakes(2, horizon=5)
         collector = Collector(env, None, frames_per_batch=20, total_frames=60)
@@ -196,12 +244,10 @@ class TestResources:
         live()
         assert held() == before
 
-    def test_close_does_not_wait_for_a_hanging_worker(self, make_fakes, tmp_path):
-        env = make_fakes(2, folder=tmp_path)
+    def test_close_does_not_wait_for_a_hanging_worker(self, make_fakes):
+        env = make_fakes(2)
         env.shutdown_timeout = 0.5
-        act(env, env.reset())
-        (tmp_path / f"{env.worker_pids[1]}.step").write_text("hang")
-        env.parent_channels[1].send(("step", {}))
+        os.kill(env.worker_pids[1], signal.SIGSTOP)
         start = time.perf_counter()
         env.close()
         assert time.perf_counter() - start < 3

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.vector.make import SerialVectorEnv
+from ba_torchrl.envs.vector.batching import SerialVectorEnv
 from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
