@@ -13,6 +13,7 @@ from __future__ import annotations
 import errno
 import fcntl
 import json
+import logging
 import os
 import re
 import shutil
@@ -39,6 +40,10 @@ _DATA_SUFFIXES = frozenset({".json", ".safetensors"})
 _TEXT_SUFFIXES = frozenset({".md", ".txt"})
 _TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"
 _CHUNK = 1 << 20
+_NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
+"""Of file systems of networks that are mounted without locks."""
+
+logger = logging.getLogger(__name__)
 
 
 def write_text(path: str | Path, text: str) -> Path:
@@ -107,6 +112,7 @@ def complete_only(path: Path, *, replace: bool = False) -> Iterator[Path]:
     Raises:
         ConfigError: another process writes it, or it exists.
     """
+    path = path.resolve() if path.is_dir() else path  # an empty one may be a link
     path.parent.mkdir(parents=True, exist_ok=True)
     lock = Lock(path.with_name(f".{path.name}.lock"), f"writes {path}; choose another path")
     scratch, old = (path.with_name(f".{path.name}{end}") for end in (".scratch", OLD))
@@ -158,14 +164,20 @@ class Lock:
                 holder = self._file.read() or "another process"
                 self._file.close()
                 raise ConfigError(f"{holder} {what}") from None
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    self.release()
+                    raise
+                logger.warning("%s: this file system has no locks, others are not kept out", path)
+                break
             self._file.close()
         self._file.truncate(0)
         try:
             name = f"process {os.getpid()} on {socket.gethostname()}"
             os.write(self._file.fileno(), name.encode())
-        except OSError:
+        except OSError as error:
             self.release()
-            raise
+            raise OSError(error.errno, error.strerror, str(path)) from error
 
     def release(self) -> None:
         """Unlock and delete the file; further calls have no effect."""

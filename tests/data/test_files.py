@@ -210,6 +210,19 @@ def test_a_folder_may_replace_the_one_before(folder, tmp_path):
     assert read_state(folder) == {"step": 4}
 
 
+def test_an_empty_folder_may_be_a_link(folder, tmp_path):
+    """To a larger disk, for example."""
+    link, target = tmp_path / "link", tmp_path / "disk" / "empty"
+    target.mkdir(parents=True)
+    link.symlink_to(target)
+    with complete_only(link) as scratch:
+        write_state(scratch, {"step": 4})
+    assert link.is_symlink()
+    assert read_state(target) == {"step": 4}
+    assert {*tmp_path.iterdir()} == {folder, link, target.parent}
+    assert list(target.parent.iterdir()) == [target]
+
+
 def test_a_second_writer_is_refused(tmp_path):
     path = tmp_path / "demos"
     with complete_only(path) as scratch:
@@ -254,9 +267,22 @@ def test_a_lock_that_cannot_name_its_process_is_deleted(tmp_path, monkeypatch):
         raise OSError(errno.ENOSPC, "full")
 
     monkeypatch.setattr(files.os, "write", full)
-    with pytest.raises(OSError, match="full"):
+    with pytest.raises(OSError, match=r"full.*/lock"):
         Lock(tmp_path / "lock", "works")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("code", "is_usable"), [(errno.ENOLCK, True), (errno.EIO, False)])
+def test_a_file_system_without_locks_is_a_warning(code, is_usable, tmp_path, monkeypatch, caplog):
+    def fails(*_):
+        raise OSError(code, "no lock")
+
+    monkeypatch.setattr(files.fcntl, "flock", fails)
+    stops = contextlib.nullcontext() if is_usable else pytest.raises(OSError, match="no lock")
+    with stops, complete_only(tmp_path / "demos") as scratch:
+        scratch.write_text("whole")
+    assert [path.name for path in tmp_path.iterdir()] == ["demos"] * is_usable
+    assert len(caplog.messages) == is_usable
 
 
 def test_a_lock_on_a_file_that_its_holder_deleted_is_none(tmp_path, monkeypatch):

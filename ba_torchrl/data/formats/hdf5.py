@@ -85,7 +85,8 @@ class Robomimic(Format):
         episodes = []
         with h5py.File(path, "r") as file:
             data = file["data"]
-            for demo in sorted(data, key=lambda name: (len(name), name)):
+            demos = [name for name in data if isinstance(data.get(name), h5py.Group)]
+            for demo in sorted(demos, key=lambda name: (len(name), name)):
                 datasets = dict(_datasets(h5py, data[demo]))
                 arrays: dict[str, Any] = {}
                 for name, dataset in datasets.items():
@@ -132,7 +133,7 @@ def _language(meta: str | bytes) -> str | None:
     """Return the instruction in robomimic's ``ep_meta``; None if there is none."""
     try:
         values = json.loads(meta)
-    except ValueError:
+    except (ValueError, TypeError):  # empty, or no text
         return None
     return values.get("lang") if isinstance(values, dict) else None
 

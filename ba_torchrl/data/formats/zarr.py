@@ -159,19 +159,26 @@ def _fault(array: Any, files: Any) -> str:
     missing = [chunk for chunk in chunks if not (files / chunk).exists()]
     if not missing:
         return ""
+    setting = "zarr.config.set({'array.write_empty_chunks': True}); "
     return (
         f"{len(missing)} of {len(chunks)} chunks of {array.path} are missing, the first "
         f"{missing[0]}; zarr reads them as {array.fill_value}. Copy the file again. If its writer "
         "left them out on purpose, as zarr 3 does with zeros, write them: "
-        "zarr.config.set({'array.write_empty_chunks': True}), then array[:] = array[:]"
+        f"{'' if _is_of_zarr_2(array) else setting}"
+        f"array = zarr.open_group(FOLDER, mode='r+')['{array.path}']; array[:] = array[:]"
     )
 
 
 def _chunk(array: Any, index: tuple[int, ...]) -> str:
     """Return the path of a chunk, or of a shard of chunks."""
-    if hasattr(array, "_chunk_key"):  # zarr 2
+    if _is_of_zarr_2(array):
         return array._chunk_key(index)
     return f"{array.path}/{array.metadata.encode_chunk_key(index)}"
+
+
+def _is_of_zarr_2(array: object) -> bool:
+    """Whether version 2 of the library, which writes all chunks, has opened the array."""
+    return hasattr(array, "_chunk_key")
 
 
 def _is_v2(array: object) -> bool:
