@@ -347,8 +347,8 @@ def _unknown_name(settings: DictConfig, path: str) -> str | None:
     for index, part in enumerate(parts):
         if not OmegaConf.is_dict(node):
             return None
-        if part not in node:
-            known = [str(key) for key in node]
+        known = [str(key) for key in node]
+        if part not in known:  # `in` is False for a value that is missing
             return f"unknown setting {'.'.join(parts[: index + 1])!r}.{known_names(part, known)}"
         # the value itself is not read: it can be an interpolation of Hydra's settings
         is_last = index == len(parts) - 1

@@ -57,7 +57,7 @@ _OF_TRAINING = {
 
 _OF_IMAGES = ("workspace", "in_hand_mode", "view_type", "view_scale")
 """Parameters of an environment that change the content of images and not their shape."""
-_WAY_OUT = "policy.make_env() makes the environment that it was trained in"
+_WAY_OUT = "policy.make_env(), or a command without env.*, makes the environment of its training"
 
 
 class PolicyCard(StrictModel):

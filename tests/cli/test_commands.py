@@ -65,6 +65,7 @@ REFUSED = [
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("play", "env.seed=5", "leave it out, and set seed"),
     ("play", "env.expert=true", "leave it out, and set policy"),
+    ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),
     ("experts", "env.num_objects=3", "unknown setting 'env'. Known: plugins, num_envs, "),
     ("experts", "variants.close_loop=null", "variants.close_loop: Input should be a valid dict"),
     ("experts", "variants.open_loop.x={seed: 3}", "variants: seed is set by the command"),
