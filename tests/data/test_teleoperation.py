@@ -15,7 +15,6 @@ import torch
 import ba_torchrl
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.cli import EXIT_CODE
-from ba_torchrl.commands import play
 from ba_torchrl.data.demo_files import read_demonstrations
 from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.episodes import is_success
@@ -234,8 +233,8 @@ def test_episodes_that_are_complete_are_kept(end, env, tmp_path, monkeypatch):
             raise AssertionError("a second writer")
         raise end
 
-    monkeypatch.setattr(play, "make", lambda *_, **__: env)
-    monkeypatch.setattr(play, "record_demonstrations", played)
+    monkeypatch.setattr("ba_torchrl.envs.factory.make", lambda *_, **__: env)
+    monkeypatch.setattr("ba_torchrl.data.teleoperation.record_demonstrations", played)
     words = (TASK, "policy=keyboard", f"path={tmp_path / 'demos'}", "env.obs_size=24")
     with contextlib.suppress(pybullet.error):
         recipe("play", *words)

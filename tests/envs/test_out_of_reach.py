@@ -38,12 +38,12 @@ def test_gymnasium_info_tells_what_is_out_of_reach():
         "ba_torchrl:BulletArm/OpenLoopBlockStacking-v0", obs_size=32, action_sequence="pxyzrrr"
     )
     _, info = env.reset(seed=0)
-    assert info["is_out_of_reach"] is False
+    assert not info["is_out_of_reach"]
     *_, info = env.step(np.array(HORIZONTAL, dtype=np.float32))
-    assert info["is_out_of_reach"] is True
+    assert info["is_out_of_reach"]
     for primitive in (0.0, 1.0):  # a place without an object is ignored
         *_, info = env.step(np.array([primitive, *VERTICAL[1:]], dtype=np.float32))
-        assert info["is_out_of_reach"] is False
+        assert not info["is_out_of_reach"]
         env.step(np.array(HORIZONTAL, dtype=np.float32))
     env.close()
 

@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+from importlib import import_module
 
 import pytest
 from hypothesis import strategies as st
@@ -11,14 +12,14 @@ from tests.fuzz.values import check, examples
 from tests.recipes import load_recipe
 
 WORK = {
-    "collect": "make_vector_env",
-    "experts": "expert_scores",
-    "play": "record_episodes",
+    "collect": "ba_torchrl.envs.factory.make_vector_env",
+    "experts": "ba_torchrl.data.demos.expert_scores",
+    "play": "ba_torchrl.training.evaluation.record_episodes",
     "soak": "run_soak",
     "measure": "measure",
     "speed": "steps_per_second",
     "evaluate": None,  # there is no checkpoint
-    "train": "Experiment",
+    "train": "ba_torchrl.training.experiment.Experiment",
     "benchmark": "plan",
     "report": None,  # there is no finished run
     "plot": "read_config",
@@ -26,7 +27,7 @@ WORK = {
     "tasks": "task_page",
     "export": None,  # there is no run
 }
-"""The first call that works, by recipe."""
+"""The first call that works, by recipe: a name in its module, or with a module of its own."""
 TEXTS = ("null", "true", "0", "-1", "1", "3", "1.5", ".nan", "1e30", "text", "''", "[]", "[a]")
 TEXTS += ("{a: 1}", "close_loop/block_reaching", "open_loop/nothing", "ur5", "/proc/no/x.mp4")
 VALUES = st.one_of(st.sampled_from(TEXTS), st.text(max_size=5), st.integers().map(str))
@@ -57,7 +58,8 @@ def test_command_lines(name, count, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     module = load_recipe(name)
     if WORK[name] is not None:
-        monkeypatch.setattr(module, WORK[name], started)
+        where, _, function = WORK[name].rpartition(".")
+        monkeypatch.setattr(import_module(where) if where else module, function, started)
     required = REQUIRED.get(name, [])
 
     def prop(overrides):

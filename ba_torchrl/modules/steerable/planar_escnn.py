@@ -105,9 +105,10 @@ def _replace_lie_learn() -> None:
 
 
 def _forget(package: str) -> None:
-    """Remove the modules of a package from those that are imported."""
+    """Remove the modules of a package from those that are imported; blocked ones (None) remain."""
     for name in [name for name in sys.modules if name.split(".")[0] == package]:
-        del sys.modules[name]
+        if sys.modules[name] is not None:
+            del sys.modules[name]
 
 
 def _raise(*_: Any, **__: Any) -> None:
