@@ -44,9 +44,7 @@ APART = {
     | {"__init__", "sim", "tasks", "envs", "data", "modules", "objectives", "algorithms"}
     | {"training", "record", "hardware"},
     # whole algorithms as scripts: no learner and no experiment
-    "recipes.torchrl": BASE
-    | {"envs", "data", "modules", "objectives", "__init__"}
-    | {"algorithms.acting", "algorithms.spatial_actions"},
+    "recipes.torchrl": BASE | {"envs", "data", "modules", "objectives", "__init__"},
 }
 LEARNING = {"torch", "tensordict", "torchrl"}
 FORBIDDEN_PACKAGES = dict.fromkeys(("sim", "tasks", *BASE), LEARNING)

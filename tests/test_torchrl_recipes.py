@@ -1,32 +1,36 @@
-"""The algorithms that are written as one script, run with tiny values."""
+"""TorchRL's parts around ours: the scripts of recipes/torchrl, and what docs/torchrl.md lists."""
 
+import ast
+import importlib
 import importlib.util
+from functools import partial
 from pathlib import Path
 
 import pytest
 import torch
-from torchrl.envs.utils import ExplorationType, exploration_type
+from torchrl import collectors, envs
+from torchrl.checkpoint import Checkpoint
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+import ba_torchrl
+from ba_torchrl.data import as_transitions
 from ba_torchrl.envs import keys
 
 FOLDER = Path(__file__).parents[1] / "recipes" / "torchrl"
-TINY = {
-    "num_envs": 2,
-    "demonstrations": 2,
-    "pretrain_updates": 2,
-    "total_updates": 4,
-    "batch_size": 4,
-    "eval_every": 2,
-    "eval_episodes": 2,
-    "final_eval_episodes": 3,
-    "device": "cpu",
-}
+REACH = "close_loop/block_reaching"
+TINY = {"demonstrations": 2, "num_envs": 2, "batch_size": 4, "eval_every": 2, "eval_episodes": 2}
 RUNS = {
-    "sacfd equi": {"task": "close_loop/block_reaching", "network": "equi", "width": 8},
-    "sacfd cnn": {"task": "close_loop/block_reaching", "network": "cnn", "width": 16},
-    "sdqfd equi_asr": {"num_objects": 2, "num_rotations": 4, "width": 0.125, "obs_size": 32},
-    "sdqfd asr": {"num_objects": 2, "network": "asr", "num_rotations": 4, "width": 0.125},
+    "sacfd": {"task": REACH, "updates": 3, "width": 8},
+    "rlpd": {"task": REACH, "steps": 3, "width": 0.125, "critics": 2},
+    "sdqfd": {
+        "num_objects": 2,
+        "pretrain_updates": 1,
+        "updates": 4,
+        "width": 0.125,
+        "num_rotations": 4,
+    },
 }
+LOSSES = {"sacfd": "SACfDLoss", "rlpd": "REDQLoss", "sdqfd": "LevelDQNLoss"}
 
 
 def script(name):
@@ -36,65 +40,148 @@ def script(name):
     return module
 
 
-@pytest.fixture
-def recorded(monkeypatch):
-    """Replays and optimisers of a script, and the kinds of exploration of its policy."""
-    found = {"explorations": []}
+def recorded(module, name, monkeypatch):
+    """Return a list that gets what the script's class or function ``name`` returns, and the
+    parameters that it starts with."""
+    make, found = getattr(module, name), []
 
-    def watch(module):
-        make, policy = module.make_replay_buffer, module.ActingPolicy
-
-        class Policy(policy):
-            def forward(self, tensordict):
-                found["explorations"].append(exploration_type())
-                return super().forward(tensordict)
-
-        def make_replay_buffer(*args):
-            found["replay"] = make(*args)
-            return found["replay"]
-
-        monkeypatch.setattr(module, "make_replay_buffer", make_replay_buffer)
-        monkeypatch.setattr(module, "ActingPolicy", Policy)
-        return found
-
-    return watch
-
-
-@pytest.mark.parametrize("run", RUNS)
-def test_a_script_trains_and_prints_its_evaluation(run, recorded, capsys):
-    name, _ = run.split()
-    module = script(name)
-    found = recorded(module)
-    weights = []
-    loss = module.make_loss
-
-    def make_loss(*args):
-        made = loss(*args)
-        weights.append((made, [p.detach().clone() for p in made.parameters()]))
+    def call(*args, **options):
+        made = make(*args, **options)
+        parameters = dict(made.named_parameters()) if isinstance(made, torch.nn.Module) else {}
+        found.append((made, {key: value.detach().clone() for key, value in parameters.items()}))
         return made
 
-    module.make_loss = make_loss
-    rate = module.main(module.Config(**TINY, **RUNS[run]))
-    assert 0 <= rate <= 1
-    assert f"success_rate {rate:.2f} over 3 episodes" in capsys.readouterr().out
-    ((made, before),) = weights
-    changed = [not torch.equal(p, q) for p, q in zip(made.parameters(), before, strict=True)]
-    assert sum(changed) > len(changed) / 2
-    is_demonstration = found["replay"].storage.column(keys.IS_DEMONSTRATION)
-    assert is_demonstration.any()
-    assert (~is_demonstration).sum() == 4  # two updates with a step of two environments each
-    assert found["explorations"].count(ExplorationType.RANDOM) == 2
-    assert ExplorationType.DETERMINISTIC in found["explorations"]
+    monkeypatch.setattr(module, name, call)
+    return found
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_script_trains_and_evaluates_alike_with_the_same_seed(
+    name, monkeypatch, capsys, tmp_path
+):
+    module = script(name)
+    losses = recorded(module, LOSSES[name], monkeypatch)
+    replays = recorded(
+        module, "OfflineToOnlineReplayBuffer" if name == "rlpd" else "make_replay", monkeypatch
+    )
+    storage = {"checkpoint": tmp_path / "run"} if name == "sacfd" else {}
+    rates = [module.main(**TINY, **RUNS[name], **options) for options in ({}, storage)]
+    assert rates[0] == rates[1]
+    assert 0 <= rates[0] <= 1
+    assert f"success_rate {rates[0]:.2f} over 2 episodes" in capsys.readouterr().out
+    (one, start), (two, _) = ((dict(loss.named_parameters()), old) for loss, old in losses)
+    assert all(torch.equal(one[key], two[key]) for key in one)
+    assert sum(not torch.equal(one[key], start[key]) for key in one) > len(one) / 2
+    replay, _ = replays[0]
+    if name == "rlpd":
+        assert len(replay.online_buffer) == 6
+        assert replay.sample()[keys.IS_DEMONSTRATION].sum() == 2
+    else:
+        is_demonstration = replay.storage.column(keys.IS_DEMONSTRATION)
+        assert is_demonstration.any()
+        assert (~is_demonstration).sum() == 6  # three steps of two environments
+    if storage:
+        loss = losses[0][0]
+        loss.load_state_dict({key: value * 0 for key, value in loss.state_dict().items()})
+        Checkpoint(loss_module=loss).load(storage["checkpoint"], components=["loss_module"])
+        assert all(torch.equal(one[key], two[key]) for key in one)
+
+
+@pytest.mark.parametrize(
+    "backend", ["threading", pytest.param("multiprocessing", marks=pytest.mark.slow)]
+)
+def test_a_pool_collects_the_same_demonstrations(backend, capsys):
+    settings = {"episodes_per_env": 2, "obs_size": 32, "batch_size": 4}
+    batch = script("async_pool").main(**settings, backend=backend)
+    assert capsys.readouterr().out.endswith("transitions, success_rate 1.00\n")
+    again = script("async_pool").main(**settings, backend="threading")
+    assert (batch == again).all()
+
+
+PUBLIC = {"ba_torchrl", *(f"ba_torchrl.{n}" for n in ("data", "envs", "modules", "objectives"))}
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)
-def test_a_script_is_one_page(path):
+def test_a_script_is_one_page_of_public_names(path):
     text = path.read_text(encoding="utf-8")
-    assert len(text.splitlines()) < 200
-    assert "Experiment" not in text
-    assert "Learner" not in text
+    assert len(text.splitlines()) < 130
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.ImportFrom) and node.module.startswith("ba_torchrl"):
+            assert node.module in PUBLIC
+            names = {alias.name for alias in node.names}
+            assert names <= {*importlib.import_module(node.module).__all__}
+        elif isinstance(node, ast.Import):
+            assert {alias.name for alias in node.names} <= {"argparse", "ba_torchrl", "torch"}
 
 
 def test_the_folder_does_not_hide_torchrl():
     # a package recipes/torchrl would be imported by recipes/*.py in place of TorchRL
     assert not (FOLDER / "__init__.py").exists()
+
+
+TASKS = {REACH: {}, "open_loop/block_stacking": {"num_objects": 2}}
+BATCHED = {
+    "SerialEnv": envs.SerialEnv,
+    "SerialEnv, without buffers": partial(envs.SerialEnv, use_buffers=False),
+    "ParallelEnv": partial(envs.ParallelEnv, mp_start_method="fork"),
+    "ParallelEnv, without buffers": partial(
+        envs.ParallelEnv, mp_start_method="fork", use_buffers=False
+    ),
+    "AsyncEnvPool": lambda _, makers: envs.AsyncEnvPool(makers, backend="threading"),
+}
+
+
+def makers(task, **options):
+    """Return constructors of two environments with different seeds."""
+    make = partial(ba_torchrl.make, task, obs_size=16, **TASKS[task], **options)
+    return [partial(make, seed=seed) for seed in (3, 4)]
+
+
+@pytest.mark.parametrize("task", TASKS)
+@pytest.mark.parametrize("name", BATCHED)
+def test_environments_in_a_vector_of_torchrl(name, task):
+    alone = [make() for make in makers(task)]
+    expected = torch.stack([env.reset() for env in alone])
+    (image,) = [key for key in alone[0].images if key != keys.IN_HAND]
+    for env in alone:
+        env.close()
+    vector = BATCHED[name](2, makers(task))
+    try:
+        assert torch.equal(vector.reset()[image], expected[image])
+        assert vector.rollout(3, break_when_any_done=False).shape == (2, 3)
+    finally:
+        vector.close()
+
+
+COLLECTORS = {
+    "Collector": lambda make: collectors.Collector(make[0], frames_per_batch=6, total_frames=12),
+    "MultiSyncCollector": lambda make: collectors.MultiSyncCollector(
+        make, frames_per_batch=6, total_frames=12
+    ),
+    "MultiAsyncCollector": lambda make: collectors.MultiAsyncCollector(
+        make, frames_per_batch=6, total_frames=12
+    ),
+    "AsyncBatchedCollector": lambda make: collectors.AsyncBatchedCollector(
+        make,
+        policy=collectors.RandomPolicy(make[0]().action_spec),
+        frames_per_batch=6,
+        total_frames=12,
+        env_backend="threading",
+    ),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COLLECTORS)
+def test_a_collector_of_torchrl_fills_a_replay(name):
+    (image,) = (env := makers(REACH)[0]()).images
+    env.close()
+    collector = COLLECTORS[name](makers(REACH))
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(50), batch_size=4)
+    try:
+        for data in collector:
+            replay.extend(as_transitions(data, [image], is_demonstration=False))
+    finally:
+        collector.shutdown()
+    assert len(replay) == 12
+    assert replay.sample()[image].shape == (4, 1, 16, 16)

@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
     from ba_torchrl.data.exchange import export_demonstrations
     from ba_torchrl.data.replay.buffer import FrameReplayBuffer
+    from ba_torchrl.data.replay.codecs import make_codecs
     from ba_torchrl.data.replay.make import make_replay
     from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
     from ba_torchrl.data.replay.symmetric import SymmetricSampler
@@ -33,6 +34,7 @@ _MODULES = {
     "expert_scores": "demos",
     "export_demonstrations": "exchange",
     "load_demonstrations": "demo_files",
+    "make_codecs": "replay.codecs",
     "make_replay": "replay.make",
     "mean_length": "episodes",
     "save_demonstrations": "demo_files",
@@ -54,6 +56,7 @@ __all__ = [
     "expert_scores",
     "export_demonstrations",
     "load_demonstrations",
+    "make_codecs",
     "make_replay",
     "mean_length",
     "save_demonstrations",

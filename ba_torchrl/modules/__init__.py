@@ -1,6 +1,7 @@
 """Networks and policies. They depend on image and action shapes, not on tasks."""
 
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
+from ba_torchrl.modules.actor_critic.critics import ActionValue
 from ba_torchrl.modules.actor_critic.equivariant import EquivariantConfig, StridedEquivariantConfig
 from ba_torchrl.modules.actor_critic.ferm import FERMConfig
 from ba_torchrl.modules.actor_critic.gaussian_policy import (
@@ -13,7 +14,12 @@ from ba_torchrl.modules.spatial.base import SpatialQNetwork, SpatialSpec
 from ba_torchrl.modules.spatial.equi_asr import EquiASRConfig
 from ba_torchrl.modules.spatial.equi_deictic_asr import EquiDeicticASRConfig
 from ba_torchrl.modules.spatial.fcn import FCN, EquiFCNConfig, FCNConfig
-from ba_torchrl.modules.spatial.policy import SpatialPolicy, spatial_policy
+from ba_torchrl.modules.spatial.policy import (
+    SpatialActions,
+    SpatialPolicy,
+    SpatialValues,
+    spatial_policy,
+)
 from ba_torchrl.modules.spatial.rot_fcn import RotFCN, RotFCNConfig
 from ba_torchrl.modules.steerable.layers import SteerableConv2d, SteerableLinear
 
@@ -22,6 +28,7 @@ __all__ = [
     "FCN",
     "NETWORKS",
     "ASRConfig",
+    "ActionValue",
     "ActorCritic",
     "ActorCriticSpec",
     "CNNConfig",
@@ -34,9 +41,11 @@ __all__ = [
     "NetworkConfig",
     "RotFCN",
     "RotFCNConfig",
+    "SpatialActions",
     "SpatialPolicy",
     "SpatialQNetwork",
     "SpatialSpec",
+    "SpatialValues",
     "SteerableConv2d",
     "SteerableLinear",
     "StridedEquivariantConfig",

@@ -1,199 +1,124 @@
-"""SACfD in one file: Soft Actor-Critic from demonstrations (appendix F), with TorchRL's parts.
+"""Soft Actor-Critic from demonstrations (SACfD) by TorchRL's SACTrainer.
 
-python recipes/torchrl/sacfd.py
-python recipes/torchrl/sacfd.py task=close_loop/drawer_opening network=equi total_updates=3000
+python recipes/torchrl/sacfd.py --task close_loop/block_picking
 
-The replay is prioritised, with a bonus for demonstrations (appendix G.2, "PER"). Sampled
-transitions are rotated, which the appendix does not do. ``recipes/train.py`` has more options,
-checkpoints, resumption, curves and videos.
+The loss adds a behaviour term on demonstrations to SAC's. The replay is prioritised, with a bonus
+for demonstrations, and sampled transitions are rotated about the vertical. Hyper-parameters are
+those of the quick start.
 """
 
-from dataclasses import dataclass
+import argparse
+from functools import partial
 
-import numpy as np
 import torch
-import tqdm
-from omegaconf import OmegaConf
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
-from torchrl.collectors import Collector
-from torchrl.envs import EnvBase
-from torchrl.envs.utils import ExplorationType, set_exploration_type
+from torchrl.checkpoint import Checkpoint
+from torchrl.collectors import Collector, Evaluator
+from torchrl.data.replay_buffers.scheduler import LinearScheduler
 from torchrl.objectives import SoftUpdate
+from torchrl.trainers.algorithms import SACTrainer
 
 import ba_torchrl
-from ba_torchrl._malloc import tune_malloc
-from ba_torchrl.algorithms.acting import ActingPolicy
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.episodes import collect_episodes, success_rate
-from ba_torchrl.data.replay.buffer import FrameReplayBuffer
-from ba_torchrl.data.replay.codecs import make_codecs
-from ba_torchrl.data.replay.make import make_replay
-from ba_torchrl.data.transitions import as_transitions
+from ba_torchrl.data import (
+    SO2Augmentation,
+    as_transitions,
+    collect_demonstrations,
+    make_codecs,
+    make_replay,
+)
 from ba_torchrl.envs import keys
-from ba_torchrl.modules.actor_critic.cnn import CNNConfig
-from ba_torchrl.modules.actor_critic.equivariant import EquivariantConfig
-from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
-from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
-from ba_torchrl.objectives.sacfd import SACfDLoss
-
-OBSERVATION = [keys.PIXELS, keys.HOLDING]
+from ba_torchrl.modules import ActorCriticSpec, EquivariantConfig, squashed_gaussian_policy
+from ba_torchrl.objectives import SACfDLoss
 
 
-@dataclass
-class Config:
-    """A run of minutes; every field can be set on the command line as ``name=value``."""
+def main(
+    task: str = "close_loop/block_picking",
+    seed: int = 0,
+    updates: int = 600,
+    demonstrations: int = 50,
+    num_envs: int = 5,
+    batch_size: int = 64,
+    width: int = 16,
+    eval_every: int = 150,
+    eval_episodes: int = 50,
+    checkpoint: str | None = None,
+) -> float:
+    """Train a policy, and return its success rate."""
+    torch.manual_seed(seed)
+    make = partial(ba_torchrl.make_vector_env, task, num_envs, parallel=False, obs_size=64)
+    single = ba_torchrl.make(task, obs_size=64, seed=seed + 10_000)
+    images, sequence = dict(single.images), single.actions.sequence
+    observation = [*images, keys.HOLDING]
 
-    task: str = "close_loop/block_picking"
-    obs_size: int = 64  # appendix: 128
-    network: str = "equi"  # or "cnn"
-    width: int = 16  # regular fields of the equivariant network; of 128 channels of the CNN
-    num_envs: int = 5
-    parallel: bool = False
-    demonstrations: int = 50
-    pretrain_updates: int = 200
-    total_updates: int = 1500
-    batch_size: int = 64
-    buffer_size: int = 100_000
-    learning_rate: float = 3e-4  # appendix: 1e-3
-    gamma: float = 0.95  # appendix: 0.99
-    tau: float = 0.05  # reference implementation: 0.01
-    demonstration_weight: float = 5.0  # reference implementation: 1
-    rotation_probability: float = 0.8  # not in the appendix
-    eval_every: int = 250
-    eval_episodes: int = 50
-    final_eval_episodes: int = 100
-    seed: int = 0
-    device: str = "cuda" if torch.cuda.is_available() else "cpu"
-
-
-def make_environment(config: Config, seed: int, expert: bool = False) -> EnvBase:
-    """Return environments that step together; with ``expert`` they observe its action."""
-    return ba_torchrl.make_vector_env(
-        config.task,
-        config.num_envs,
-        parallel=config.parallel,
-        obs_size=config.obs_size,
-        seed=seed,
-        expert=expert,
-    )
-
-
-def make_replay_buffer(config: Config, codecs: dict, seed: int) -> FrameReplayBuffer:
-    """Return a prioritised replay, which keeps each frame once, compressed."""
-    return make_replay(
-        "prioritized", config.buffer_size, config.batch_size, codecs=codecs, seed=seed
-    )
-
-
-def make_networks(config: Config, images: dict, sequence: str) -> ActorCritic:
-    """Return actor, encoder and twin critics."""
-    depth = {"depth_center_m": 0.2, "depth_scale_m": 0.1}  # inputs of unit size
-    if config.network == "equi":
-        network = EquivariantConfig(n_hidden=config.width, **depth)
-    else:
-        network = CNNConfig(width=config.width / 128, **depth)
-    networks = network.build(ActorCriticSpec(images, sequence))
-    return ActorCritic(*(module.to(config.device) for module in networks))
-
-
-def make_loss(config: Config, networks: ActorCritic) -> SACfDLoss:
-    """Return the loss of actor, critics and entropy temperature."""
-    critic_inputs = ["critic_features", keys.ACTION]
+    config = EquivariantConfig(n_hidden=width, depth_center_m=0.2, depth_scale_m=0.1)
+    networks = config.build(ActorCriticSpec(images, sequence))
+    policy = squashed_gaussian_policy(networks.actor, observation)
     loss = SACfDLoss(
-        squashed_gaussian_policy(networks.actor, OBSERVATION),
-        TensorDictModule(networks.encoder, OBSERVATION, ["critic_features"]),
-        TensorDictModule(networks.critic, critic_inputs, ["state_action_value"]),
-        demonstration_weight=config.demonstration_weight,
-        demonstration_distance="kl",  # reference implementation: the squared error
-        entropy_backup=False,  # as in the quick start; reference implementation: true
-        weight_norm="max",  # Schaul et al., 2016; TorchRL's losses: "mean"
-    )
-    return loss.make_value_estimator(gamma=config.gamma).to(config.device)
-
-
-def demonstrate(config: Config, seed: int) -> list[TensorDict]:
-    """Return episodes of the expert."""
-    env = make_environment(config, seed, expert=True)
-    episodes = collect_demonstrations(env, config.demonstrations, seed=seed)
-    env.close()
-    return episodes
-
-
-def evaluate(config: Config, env: EnvBase, policy: ActingPolicy, episodes: int, seed: int) -> float:
-    """Return the success rate of the greedy policy."""
-
-    def act(state: TensorDictBase) -> TensorDictBase:
-        seen = state.select(*policy.in_keys).to(config.device)
-        return state.set(keys.ACTION, policy(seen)[keys.ACTION].cpu())
-
-    with set_exploration_type(ExplorationType.DETERMINISTIC):
-        return success_rate(collect_episodes(env, act, episodes, seed=seed, results_only=True))
-
-
-def main(config: Config) -> float:
-    """Train, and return the success rate of the last policy."""
-    torch.manual_seed(config.seed)
-    seeds = np.random.SeedSequence(config.seed).generate_state(6).tolist()
-    demo_seed, train_seed, eval_seed, report_seed, replay_seed, rotation_seed = seeds
-    single = ba_torchrl.make(config.task, obs_size=config.obs_size)
-    images, sequence = {keys.PIXELS: single.images[keys.PIXELS]}, single.actions.sequence
-    single.close()
-    codecs = make_codecs(images)
-
-    networks = make_networks(config, images, sequence)
-    loss = make_loss(config, networks)
-    actor = squashed_gaussian_policy(networks.actor, OBSERVATION)
-    policy = ActingPolicy(actor, codecs).to(config.device)  # acts on images as they are stored
-    replay = make_replay_buffer(config, codecs, replay_seed)
-    rotate = SO2Augmentation(
-        images, sequence, seed=rotation_seed, probability=config.rotation_probability
-    )
-    optimizer = torch.optim.Adam(loss.parameters(), lr=config.learning_rate)
-    target_updater = SoftUpdate(loss, tau=config.tau)
-    bar = tqdm.tqdm(total=config.total_updates, unit="update")
-
-    def update() -> None:
-        replay.sampler.anneal(bar.n / config.total_updates)
-        batch = rotate(replay.sample().to(config.device))
-        losses = loss(batch)
-        optimizer.zero_grad()
-        (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
-        optimizer.step()
-        target_updater.step()
-        replay.update_tensordict_priority(batch.select("index", keys.TD_ERROR).cpu())
-        bar.update()
-        if bar.n % config.eval_every == 0 and bar.n < config.total_updates:
-            rate = evaluate(config, eval_env, policy, config.eval_episodes, eval_seed)
-            bar.set_postfix(success=f"{rate:.2f}", q=f"{losses['q_value'].item():.2f}")
-
-    eval_env = make_environment(config, eval_seed)
-    for episode in demonstrate(config, demo_seed):
-        replay.extend(as_transitions(episode, images, is_demonstration=True))
-    for _ in range(config.pretrain_updates):
-        update()
-    env = make_environment(config, train_seed)
-    collector = Collector(
-        env,
         policy,
-        frames_per_batch=config.num_envs,
-        total_frames=config.num_envs * (config.total_updates - config.pretrain_updates),
-        policy_device=config.device,
-        storing_device="cpu",
+        TensorDictModule(networks.encoder, observation, ["features"]),
+        TensorDictModule(networks.critic, ["features", keys.ACTION], ["state_action_value"]),
+        demonstration_weight=5.0,
+        demonstration_distance="kl",
+        entropy_backup=False,
+    )
+    loss.make_value_estimator(gamma=0.95)
+
+    replay = make_replay("prioritized", 100_000, batch_size, codecs=make_codecs(images), seed=seed)
+    for episode in collect_demonstrations(make(seed=seed + 20_000, expert=True), demonstrations):
+        replay.extend(as_transitions(episode, images, is_demonstration=True))
+    weights = LinearScheduler(replay, "beta", final_value=1.0, num_steps=updates)
+    rotate = SO2Augmentation(images, sequence, seed=seed)
+
+    collector = Collector(
+        make(seed=seed),
+        policy,
+        frames_per_batch=num_envs,
+        total_frames=num_envs * updates,
+        postproc=partial(as_transitions, images=images, is_demonstration=False),
         auto_register_policy_transforms=False,
     )
-    for data in collector:
-        replay.extend(as_transitions(data, images, is_demonstration=False))
-        update()
-    collector.shutdown()
-    bar.close()
-    rate = evaluate(config, eval_env, policy, config.final_eval_episodes, report_seed)
-    eval_env.close()
-    print(f"success_rate {rate:.2f} over {config.final_eval_episodes} episodes")
-    return rate
+    trainer = SACTrainer(
+        collector=collector,
+        total_frames=num_envs * updates,
+        frame_skip=1,
+        optim_steps_per_batch=1,
+        loss_module=loss,
+        optimizer=torch.optim.Adam(loss.parameters(), lr=3e-4),
+        target_net_updater=SoftUpdate(loss, tau=0.05),
+        replay_buffer=replay,
+        log_rewards=False,  # would need TorchRL's RewardSum(out_keys=["reward_sum"])
+        checkpoint=None if checkpoint is None else Checkpoint(),
+        save_trainer_file=checkpoint,
+    )
+    evaluator = Evaluator(
+        single,  # of environments that step together, short episodes would count more
+        policy,
+        num_trajectories=eval_episodes,
+        frames_per_batch=single.max_steps,
+        collector_kwargs={"traj_format": "cat", "auto_register_policy_transforms": False},
+    )
+
+    rates = []
+
+    def evaluate(data: TensorDictBase) -> None:
+        count = trainer.collected_frames // num_envs
+        if count % eval_every == 0 or count == updates:
+            rates.append(evaluator.evaluate()["eval/reward"])
+            print(f"update {count}: success_rate {rates[-1]:.2f} over {eval_episodes} episodes")
+
+    trainer.register_op("process_optim_batch", rotate)
+    trainer.register_op("post_optim", weights.step)
+    trainer.register_op("post_steps_log", evaluate)
+    trainer.train()
+    evaluator.shutdown()
+    return rates[-1]
 
 
 if __name__ == "__main__":
-    tune_malloc()  # halves the time of an update on a CPU
-    main(OmegaConf.to_object(OmegaConf.merge(OmegaConf.structured(Config), OmegaConf.from_cli())))
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--task", default="close_loop/block_picking")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--updates", type=int, default=600)
+    parser.add_argument("--checkpoint")
+    main(**vars(parser.parse_args()))
