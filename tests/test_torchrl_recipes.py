@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict.nn import TensorDictModule
 from torchrl import collectors, envs
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
@@ -80,6 +81,9 @@ def test_a_script_trains_and_evaluates_alike_with_the_same_seed(
         is_demonstration = replay.storage.column(keys.IS_DEMONSTRATION)
         assert is_demonstration.any()
         assert (~is_demonstration).sum() == 6  # three steps of two environments
+        truncated = replay.storage.column((keys.NEXT, keys.TRUNCATED))
+        online = truncated[~is_demonstration].tolist()
+        assert online == [False, name == "sacfd"] * 3  # of a batch, SACTrainer sets the last
     if storage:
         loss = losses[0][0]
         loss.load_state_dict({key: value * 0 for key, value in loss.state_dict().items()})
@@ -163,7 +167,9 @@ COLLECTORS = {
     ),
     "AsyncBatchedCollector": lambda make: collectors.AsyncBatchedCollector(
         make,
-        policy=collectors.RandomPolicy(make[0]().action_spec),
+        policy=TensorDictModule(
+            lambda holding: torch.zeros(len(holding), 5), ["holding"], ["action"]
+        ),
         frames_per_batch=6,
         total_frames=12,
         env_backend="threading",

@@ -1,7 +1,7 @@
 """Networks and policies. They depend on image and action shapes, not on tasks."""
 
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
-from ba_torchrl.modules.actor_critic.critics import ActionValue
+from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.equivariant import EquivariantConfig, StridedEquivariantConfig
 from ba_torchrl.modules.actor_critic.ferm import FERMConfig
 from ba_torchrl.modules.actor_critic.gaussian_policy import (
@@ -46,6 +46,7 @@ __all__ = [
     "SpatialQNetwork",
     "SpatialSpec",
     "SpatialValues",
+    "StateValue",
     "SteerableConv2d",
     "SteerableLinear",
     "StridedEquivariantConfig",
