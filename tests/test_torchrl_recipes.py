@@ -22,7 +22,7 @@ REACH = "close_loop/block_reaching"
 TINY = {"demonstrations": 2, "num_envs": 2, "batch_size": 4, "eval_every": 2, "eval_episodes": 2}
 RUNS = {
     "sacfd": {"task": REACH, "updates": 3, "width": 8},
-    "rlpd": {"task": REACH, "steps": 3, "width": 0.125, "critics": 2},
+    "rlpd": {"task": REACH, "steps": 3, "width": 8},
     "sdqfd": {
         "num_objects": 2,
         "pretrain_updates": 1,

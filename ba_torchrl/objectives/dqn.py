@@ -132,7 +132,7 @@ class LevelDQNLoss(TransitionLoss):
         loss_demonstration = weight * sum over levels of the chosen term on the experts' samples
 
     The target bootstraps on truncated steps and not on terminated ones. ``forward`` also writes the
-    priority, the mean of |Q_level - y| over the levels, of shape [B, 1], into its input.
+    priority, the mean of ``|Q_level - y|`` over the levels, of shape [B, 1], into its input.
 
     Args:
         value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a

@@ -22,8 +22,8 @@ class RLPDLoss(SACfDLoss):
         y_i        = r_i + gamma (1 - terminated_i) (min_{k in M} q'_k(s'_i, a') - h_i)
         loss_actor = mean_i (alpha log pi(a | s_i) - mean_k q_k(s_i, a))
 
-    h_i is alpha log pi(a'|s'_i), or 0 without entropy backup. TorchRL's ``REDQLoss`` has the same
-    terms for critics that are whole networks, each with an encoder of its own.
+    h_i is ``alpha log pi(a'|s'_i)``, or 0 without entropy backup. TorchRL's ``REDQLoss`` has the
+    same terms for critics that are whole networks, each with an encoder of its own.
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.

@@ -52,7 +52,7 @@ class SACfDLoss(TransitionLoss):
 
     `contrastive_loss` trains the encoder with another loss, for optimisers of its own.
 
-    ``forward`` also writes the priority, mean_k |q_k - y| of shape [..., 1], into its input.
+    ``forward`` also writes the priority, ``mean_k |q_k - y|`` of shape [..., 1], into its input.
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.

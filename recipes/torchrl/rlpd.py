@@ -1,6 +1,6 @@
 """RLPD by TorchRL's REDQLoss: SAC with an ensemble of critics, half of the data demonstrations.
 
-python recipes/torchrl/rlpd.py --task close_loop/block_picking
+python recipes/torchrl/rlpd.py --task close_loop/block_reaching
 
 Loss, replay, collector and evaluation are TorchRL's; environments, experts and networks are ours.
 The critics are whole networks with layer normalisation. Ball et al. (2023) have ten of them and
@@ -19,19 +19,24 @@ from torchrl.objectives import REDQLoss, SoftUpdate
 import ba_torchrl
 from ba_torchrl.data import as_transitions, collect_demonstrations
 from ba_torchrl.envs import keys
-from ba_torchrl.modules import ActionValue, ActorCriticSpec, CNNConfig, squashed_gaussian_policy
+from ba_torchrl.modules import (
+    ActionValue,
+    ActorCriticSpec,
+    EquivariantConfig,
+    squashed_gaussian_policy,
+)
 
 
 def main(
-    task: str = "close_loop/block_picking",
+    task: str = "close_loop/block_reaching",
     seed: int = 0,
-    steps: int = 1500,
+    steps: int = 600,
     demonstrations: int = 50,
     num_envs: int = 5,
     batch_size: int = 64,
-    width: float = 0.125,
-    critics: int = 4,
-    eval_every: int = 300,
+    width: int = 8,
+    critics: int = 2,
+    eval_every: int = 150,
     eval_episodes: int = 50,
 ) -> float:
     """Train a policy with one update per step of all environments, and return its success rate."""
@@ -41,7 +46,7 @@ def main(
     images, sequence = dict(single.images), single.actions.sequence
     observation = [*images, keys.HOLDING]
 
-    config = CNNConfig(width=width, depth_center_m=0.2, depth_scale_m=0.1)
+    config = EquivariantConfig(n_hidden=width, depth_center_m=0.2, depth_scale_m=0.1)
     spec = ActorCriticSpec(images, sequence, critics=1)  # one with layer normalisation
     policy = squashed_gaussian_policy(config.build(spec).actor, observation)
     values = [config.build(spec) for _ in range(critics)]
@@ -60,6 +65,7 @@ def main(
         alpha_init=0.01,
         min_alpha=1e-4,
         target_entropy=-float(len(sequence)),
+        deactivate_vmap=True,  # a loop is faster on a CPU
     )
     loss.make_value_estimator(gamma=0.95)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
@@ -102,7 +108,7 @@ def main(
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--task", default="close_loop/block_picking")
+    parser.add_argument("--task", default="close_loop/block_reaching")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=1500)
+    parser.add_argument("--steps", type=int, default=600)
     main(**vars(parser.parse_args()))

@@ -35,12 +35,12 @@ from ba_torchrl.objectives import SACfDLoss
 def main(
     task: str = "close_loop/block_picking",
     seed: int = 0,
-    updates: int = 600,
+    updates: int = 300,
     demonstrations: int = 50,
     num_envs: int = 5,
     batch_size: int = 64,
     width: int = 16,
-    eval_every: int = 150,
+    eval_every: int = 100,
     eval_episodes: int = 50,
     checkpoint: str | None = None,
 ) -> float:
@@ -119,6 +119,6 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="close_loop/block_picking")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--updates", type=int, default=600)
+    parser.add_argument("--updates", type=int, default=300)
     parser.add_argument("--checkpoint")
     main(**vars(parser.parse_args()))

@@ -22,7 +22,7 @@ _segment_tree.install()  # also for a replay without environments
 class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
     """Prioritised sampling that prefers demonstrations (appendix G.2).
 
-    A transition is drawn in proportion to p ^ alpha, with p = |td| + eps, plus the bonus for a
+    A transition is drawn in proportion to p ^ alpha, with ``p = |td| + eps``, plus the bonus for a
     demonstration. A new one, demonstration or not, has the largest p that an update has set so far,
     and at least one, as in Schaul et al. (2016) and the reference implementation. Each draw has the
     importance weight ``priority_weight`` = (p / p_min) ^ (-alpha beta), in (0, 1]; the loss

@@ -102,7 +102,7 @@ class SpatialQNetwork(nn.Module, ABC):
             holding: [B, 1], true where an object is held; follows all input images.
 
         Returns:
-            float32 [B, *levels[0].shape], and a state of any type, None if there is one level.
+            float32 ``[B, *levels[0].shape]``, and a state of any type, None if there is one level.
         """
 
     def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ class SpatialQNetwork(nn.Module, ABC):
             chosen: int64 [B, n], indices of the components chosen so far, level after level.
 
         Returns:
-            float32 [B, *levels[level].shape].
+            float32 ``[B, *levels[level].shape]``.
         """
         raise NotImplementedError(f"{type(self).__name__} has one level")
 
