@@ -15,15 +15,15 @@ from ba_torchrl.objectives.sacfd import SACfDLoss
 
 
 class LinearPolicy(nn.Module):
-    """loc = W [pixels, holding], scale constant per component."""
+    """loc = W [depth, holding], scale constant per component."""
 
     def __init__(self):
         super().__init__()
         self.net = nn.Linear(3, 2)
         self.log_std = nn.Parameter(torch.tensor([-0.5, -1.0]))
 
-    def forward(self, pixels, holding):
-        x = torch.cat([pixels, holding.to(pixels.dtype)], dim=-1)
+    def forward(self, depth, holding):
+        x = torch.cat([depth, holding.to(depth.dtype)], dim=-1)
         loc = self.net(x)
         return loc, self.log_std.exp().expand_as(loc)
 
@@ -33,8 +33,8 @@ class LinearEncoder(nn.Module):
         super().__init__()
         self.net = nn.Linear(3, 4)
 
-    def forward(self, pixels, holding):
-        return torch.tanh(self.net(torch.cat([pixels, holding.to(pixels.dtype)], dim=-1)))
+    def forward(self, depth, holding):
+        return torch.tanh(self.net(torch.cat([depth, holding.to(depth.dtype)], dim=-1)))
 
 
 class LinearCritics(nn.Module):
@@ -66,7 +66,7 @@ def make(
     distribution=NoiselessTanhNormal, seed=0, policy=None, kind=SACfDLoss, critics=2, **settings
 ):
     torch.manual_seed(seed)
-    observation = [keys.PIXELS, keys.HOLDING]
+    observation = [keys.DEPTH, keys.HOLDING]
     network = TensorDictModule(policy or LinearPolicy(), observation, ["loc", "scale"])
     head = ProbabilisticTensorDictModule(
         in_keys=["loc", "scale"],
@@ -100,11 +100,11 @@ def batch(experts=(True, False, True, False), weights=(0.2, 0.8, 0.4, 0.1)):
 
     terminated, truncated = flag(False, True, False, True), flag(False, False, True, False)
     data = {
-        keys.PIXELS: rand(4, 2),
+        keys.DEPTH: rand(4, 2),
         keys.HOLDING: flag(True, False, False, True),
         keys.ACTION: rand(4, 2),
         keys.NEXT: {
-            keys.PIXELS: rand(4, 2),
+            keys.DEPTH: rand(4, 2),
             keys.HOLDING: flag(False, False, True, True),
             keys.REWARD: torch.tensor([[0.0], [0.0], [0.5], [1.0]], dtype=torch.float64),
             keys.TERMINATED: terminated,

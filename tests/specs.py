@@ -15,13 +15,13 @@ def slow_except(values, fast):
 
 
 def close_loop_images(size=64, high_m=0.39):
-    return {"pixels": ImageSpec(1, size, high_m, storage="uint8")}
+    return {"depth": ImageSpec(1, size, high_m, storage="uint8")}
 
 
 def open_loop_images(size=32, in_hand_size=24, channels=1, high_m=0.24):
     axes = ("yz", "xz", "xy") if channels == 3 else ()
     return {
-        "pixels": ImageSpec(1, size, high_m),
+        "heightmap": ImageSpec(1, size, high_m),
         "in_hand": ImageSpec(channels, in_hand_size, high_m, frame="gripper", channel_axes=axes),
     }
 

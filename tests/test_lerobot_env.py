@@ -51,7 +51,7 @@ def test_a_suite_of_vectors(hub, n_envs, use_async_envs):
         )
         assert vector.call("task_description") == ("pick up the red block",) * n_envs
         assert vector.observation_space.contains(observation)
-        assert observation["images.pixels"].shape == (n_envs, 1, 64, 64)
+        assert observation["images.depth"].shape == (n_envs, 1, 64, 64)
         assert observation["agent_pos"].dtype == np.float32
         rgb = observation["pixels"]["rgb"]
         assert (rgb.shape, rgb.dtype) == ((n_envs, 64, 64, 3), np.uint8)
@@ -87,7 +87,7 @@ def test_lerobot_loads_it(tmp_path, monkeypatch):
     vector = suites["ba_torchrl"][0]
     observation, _ = vector.reset(seed=[0, 1])
     batch = utils.preprocess_observation(observation)
-    assert batch["observation.images.pixels"].shape == (2, 1, 128, 128)
+    assert batch["observation.images.depth"].shape == (2, 1, 128, 128)
     assert batch["observation.state"].shape == (2, 1)
     utils.check_env_attributes_and_types(vector)
     close(suites)

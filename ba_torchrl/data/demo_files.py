@@ -21,6 +21,7 @@ from ba_torchrl.data.exchange import (
     import_demonstrations,
 )
 from ba_torchrl.data.files import (
+    RENAMED,
     check,
     complete_only,
     read_json,
@@ -33,6 +34,7 @@ from ba_torchrl.data.formats.base import find_format
 from ba_torchrl.errors import ConfigError
 
 _METADATA_FILE = "demonstrations.json"
+_FORMAT = 2
 _LENGTHS, _SEPARATOR = "episode_lengths", "."
 
 
@@ -77,6 +79,7 @@ def save_demonstrations(
         value = steps[key]  # an instruction is a string, or a list with one per step
         entries[key] = [value] * len(steps) if isinstance(value, str) else value
     metadata = {
+        "format": _FORMAT,
         "task": task,
         "env": env_values(task, env),
         "seed": seed,
@@ -205,6 +208,10 @@ def read_metadata(path: Path) -> dict[str, Any]:
         not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
     ):
         raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
+    if metadata.get("format") != _FORMAT:
+        raise ConfigError(
+            f"{path} is of another version: {RENAMED}; collect the demonstrations again"
+        )
     return metadata
 
 

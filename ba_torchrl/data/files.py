@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 OLD = ".old"
 """Suffix of a folder that `complete_only` replaces."""
 CHECKSUMS_FILE = "checksums.json"
+RENAMED = "the image with the key pixels is now depth in close loop, heightmap in open loop"
+"""Why files of another format are refused."""
 _DATA_SUFFIXES = frozenset({".json", ".safetensors"})
 _TEXT_SUFFIXES = frozenset({".md", ".txt"})
 _TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"

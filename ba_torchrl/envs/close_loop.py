@@ -80,7 +80,7 @@ class CloseLoopEnv(RecordedPosition, ManipulationEnv):
         low, high = self._view.range_m(self._view_setup)
         channels, size = self._view.channels, self.config.obs_size
         frame: Frame = "scene" if self._view.rotates_with_scene else "camera"
-        return {keys.PIXELS: ImageSpec(channels, size, high, low, storage="uint8", frame=frame)}
+        return {keys.DEPTH: ImageSpec(channels, size, high, low, storage="uint8", frame=frame)}
 
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center
@@ -102,7 +102,7 @@ class CloseLoopEnv(RecordedPosition, ManipulationEnv):
         seen = ViewInput(
             self._view_setup, scene.world, scene.camera, robot.tool_pose(), robot.opening()
         )
-        return {keys.PIXELS: self._view.image(seen)}
+        return {keys.DEPTH: self._view.image(seen)}
 
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())

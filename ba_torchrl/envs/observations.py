@@ -217,12 +217,12 @@ class Joints(Observation):
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the angles."""
         shape = (len(scene.robot.arm_joints),)
-        return {keys.JOINT_POSITIONS: Unbounded(shape, device="cpu", dtype=torch.float32)}
+        return {keys.JOINTS: Unbounded(shape, device="cpu", dtype=torch.float32)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the measured angles, radians."""
         angles = scene.robot.measured_joints()
-        return {keys.JOINT_POSITIONS: torch.tensor(angles, device="cpu", dtype=torch.float32)}
+        return {keys.JOINTS: torch.tensor(angles, device="cpu", dtype=torch.float32)}
 
 
 @OBSERVATIONS.register("wrist_rgb")

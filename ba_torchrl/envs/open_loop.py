@@ -112,7 +112,7 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         else:  # projections: numbers of voxels
             in_hand = ImageSpec(3, patch, patch, frame="gripper", channel_axes=("yz", "xz", "xy"))
         return {
-            keys.PIXELS: ImageSpec(1, self.config.obs_size, highest_m),
+            keys.HEIGHTMAP: ImageSpec(1, self.config.obs_size, highest_m),
             keys.IN_HAND: in_hand,
         }
 
@@ -151,7 +151,7 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
         size = self.config.in_hand_size
         empty = np.zeros((self._in_hand_kind.channels, size, size))
         heights = np.clip(self._heightmap(scene), 0.0, self.workspace.z[1])
-        return {keys.PIXELS: heights[None], keys.IN_HAND: self._memory.get("in_hand", empty)}
+        return {keys.HEIGHTMAP: heights[None], keys.IN_HAND: self._memory.get("in_hand", empty)}
 
     def _is_holding(self, scene: Scene) -> bool:
         return scene.controller.held is not None

@@ -54,13 +54,13 @@ class ActorCriticSpec:
 
     @property
     def image_size(self) -> int:
-        """Rows and columns of ``pixels``."""
-        return self.images[keys.PIXELS].size
+        """Rows and columns of ``depth``."""
+        return self.images[keys.DEPTH].size
 
     @property
     def image_channels(self) -> int:
-        """Channels of ``pixels``."""
-        return self.images[keys.PIXELS].channels
+        """Channels of ``depth``."""
+        return self.images[keys.DEPTH].channels
 
     @property
     def vector_size(self) -> int:

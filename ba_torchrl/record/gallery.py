@@ -54,7 +54,7 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
     recorder = FrameRecorder(env)
     try:
         state = env.reset()
-        first = state[keys.PIXELS][0].numpy()
+        first = state[next(iter(env.images))][0].numpy()
         recorder.record()
         while not state[keys.DONE]:
             action = state[keys.EXPERT_ACTION]

@@ -30,6 +30,11 @@ def make_small(task: str, **config: Any) -> ManipulationEnv:
     return make(task, **{"obs_size": size, "seed": 0, **config})
 
 
+def image_of(data: TensorDictBase) -> torch.Tensor:
+    """Return the control's image in an observation, or in several."""
+    return data[keys.DEPTH if keys.DEPTH in data else keys.HEIGHTMAP]
+
+
 def continues(task: str) -> bool:
     """Return whether an episode of a task can start from the last scene of the previous one."""
     return TASKS[task].continues is not Task.continues

@@ -28,6 +28,7 @@ from ba_torchrl.testing.episodes import (
     action_at,
     continues,
     expert_policy,
+    image_of,
     make_small,
     play_expert,
     random_actions,
@@ -161,15 +162,15 @@ def check_seeds(task: str, **config: Any) -> None:
     make_env = functools.partial(make_small, task, **config)
     with closing(make_env()) as first, closing(make_env()) as second:
         policy = _constant_policy(first, 0.65, 0.25, 0.85, 0.0, 0.6)
-        a, b = (env.rollout(4, policy)[keys.NEXT, keys.PIXELS] for env in (first, second))
+        a, b = (image_of(env.rollout(4, policy)[keys.NEXT]) for env in (first, second))
         assert torch.equal(a, b), f"{task}: two environments with the same seed differ"
         first.set_seed(0)
         again = first.rollout(4, policy)
-        assert torch.equal(again[keys.NEXT, keys.PIXELS], a), (
+        assert torch.equal(image_of(again[keys.NEXT]), a), (
             f"{task}: the same seed gives another episode the second time"
         )
-        other = first.reset(seed=1)[keys.PIXELS]
-        assert not torch.equal(other, again[keys.PIXELS][0]), f"{task}: the seed changes nothing"
+        other = image_of(first.reset(seed=1))
+        assert not torch.equal(other, image_of(again)[0]), f"{task}: the seed changes nothing"
 
 
 def check_successive_episodes(task: str, **config: Any) -> None:
@@ -177,7 +178,7 @@ def check_successive_episodes(task: str, **config: Any) -> None:
     if continues(task):
         return
     with closing(make_small(task, **config)) as env:
-        a, b = (env.reset()[keys.PIXELS] for _ in range(2))
+        a, b = (image_of(env.reset()) for _ in range(2))
         assert not torch.equal(a, b), f"{task}: two episodes start from the same scene"
 
 
@@ -186,14 +187,14 @@ def check_observations_are_copies(task: str, **config: Any) -> None:
     with closing(make_small(task, expert=True, **config)) as env:
         state = env.reset()
         while True:
-            kept, copy = state[keys.PIXELS], state[keys.PIXELS].clone()
+            kept, copy = image_of(state), image_of(state).clone()
             following = env.step(expert_policy(state))[keys.NEXT]
             assert not following[keys.FAULT], f"{task}: a simulator fault, which the log shows"
             assert torch.equal(kept, copy), f"{task}: a step changed an image returned before it"
             if following[keys.DONE]:
                 break
             state = following
-        assert not torch.equal(copy, following[keys.PIXELS]), f"{task}: the image never changes"
+        assert not torch.equal(copy, image_of(following)), f"{task}: the image never changes"
 
 
 def check_random_actions(task: str, **config: Any) -> None:
@@ -321,7 +322,7 @@ def check_expert_is_passive(task: str, **config: Any) -> None:
     make_env = functools.partial(make_small, task, **config)
     with closing(make_env(expert=True)) as computed, closing(make_env()) as plain:
         policy = _constant_policy(plain, 0.0, 0.7, 0.7, 0.05, 0.55)
-        a, b = (env.rollout(6, policy)[keys.NEXT, keys.PIXELS] for env in (computed, plain))
+        a, b = (image_of(env.rollout(6, policy)[keys.NEXT]) for env in (computed, plain))
         assert torch.equal(a, b), f"{task}: computing the expert's action changes the episode"
         for _ in range(5):
             computed.scene.task.expert_command()
@@ -336,16 +337,16 @@ def check_partial_resets(task: str, **config: Any) -> None:
         state = env.reset()
         space = env.action_spec.space
         state = env.step(state.set(keys.ACTION, (space.low + space.high) / 2))[keys.NEXT]
-        before = state[keys.PIXELS].clone()
+        before = image_of(state).clone()
         state["_reset"] = torch.tensor([[True], [False]])
         after = env.reset(state)
     counts = after[keys.STEP_COUNT].flatten().tolist()
     assert counts == [0, 1], f"{task}: step counts {counts} after a reset of the first environment"
-    assert torch.equal(after[keys.PIXELS][1], before[1]), (
+    assert torch.equal(image_of(after)[1], before[1]), (
         f"{task}: the reset of one environment changed the image of another"
     )
     if TASKS[task].control == "close_loop" and not continues(task):
-        assert not torch.equal(after[keys.PIXELS][0], before[0]), (
+        assert not torch.equal(image_of(after)[0], before[0]), (
             f"{task}: the environment that was reset shows the same scene"
         )
 

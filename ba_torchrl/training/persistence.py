@@ -20,6 +20,7 @@ from torchrl.checkpoint import (
 
 from ba_torchrl.data.files import (
     OLD,
+    RENAMED,
     Lock,
     check,
     complete_only,
@@ -37,7 +38,8 @@ LOCK_FILE = "run.lock"
 class _StateAdapter(CheckpointAdapter):
     """Writes a component's ``state_dict`` with `write_state`."""
 
-    adapter_id = "ba_torchrl.state.2"  # 1: weights of kernels whose signs depended on the CPU
+    adapter_id = "ba_torchrl.state.3"
+    # 1: weights of kernels whose signs depended on the CPU; 2: images under other keys
 
     def save(self, component: Any, path: Path, **_: Any) -> None:
         write_state(path, component.state_dict())
@@ -83,6 +85,8 @@ class DurableCheckpoint(Checkpoint):
             return super().load(path, **options)
         except (CheckpointError, OSError, ValueError, KeyError, TypeError) as error:
             reason = " ".join(str(error).split())
+            if "ba_torchrl.state.2" in reason:
+                reason = f"{RENAMED}; train again"
             raise ConfigError(
                 f"{path} does not fit this version or configuration: {reason}"
             ) from error

@@ -110,10 +110,10 @@ class Trunk(nn.Module):
         self.layers = nn.ModuleList(layers)
         self.out_type = inputs
 
-    def forward(self, pixels: Tensor, holding: Tensor) -> Tensor:
-        """Return features [B, F, 1, 1] of pixels [B, 1, H, W] and holding [B, 1]."""
-        holds = holding.to(pixels)[..., None, None].expand_as(pixels)
-        x = self.in_type(torch.cat([pixels, holds], dim=1))
+    def forward(self, depth: Tensor, holding: Tensor) -> Tensor:
+        """Return features [B, F, 1, 1] of depth [B, 1, H, W] and holding [B, 1]."""
+        holds = holding.to(depth)[..., None, None].expand_as(depth)
+        x = self.in_type(torch.cat([depth, holds], dim=1))
         for layer in self.layers:
             x = layer(x)
         return x.tensor
@@ -135,9 +135,9 @@ class Actor(nn.Module):
         outputs = fields.of(*self.action.types(fields.gspace, extra_invariants=self.action.size))
         self.head = _convolution(self.trunk.out_type, outputs, 1)
 
-    def forward(self, pixels: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, depth: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return (loc, scale), each [B, A]."""
-        features = self.trunk.out_type(self.trunk(pixels, holding))
+        features = self.trunk.out_type(self.trunk(depth, holding))
         loc, log_std = self.head(features).tensor.flatten(1).split(self.action.size, dim=-1)
         return self.action.ungroup(loc), scale_from_log_std(log_std)
 
@@ -164,10 +164,10 @@ class Critic(nn.Module):
         invariants, value = fields.trivial(n_hidden), fields.trivial(1)
         self.values = nn.ModuleList(_convolution(invariants, value, 1) for _ in range(2))
 
-    def forward(self, pixels: Tensor, holding: Tensor, action: Tensor) -> Tensor:
+    def forward(self, depth: Tensor, holding: Tensor, action: Tensor) -> Tensor:
         """Return twin values [B, 2]."""
         grouped = self.action.group(action)[..., None, None]
-        x = self.in_type(torch.cat([self.trunk(pixels, holding), grouped], dim=1))
+        x = self.in_type(torch.cat([self.trunk(depth, holding), grouped], dim=1))
         heads = zip(self.hidden, self.values, strict=True)
         return torch.cat(
             [value(self.invariant(hidden(x))).tensor.flatten(1) for hidden, value in heads], dim=1
@@ -223,17 +223,17 @@ class EscnnSACfD:
         following = batch[keys.NEXT]
         with torch.no_grad():
             action, log_prob = self._sample(following)
-            values = self.target(following[keys.PIXELS], following[keys.HOLDING], action)
+            values = self.target(following[keys.DEPTH], following[keys.HOLDING], action)
             value = values.amin(dim=1) - self.log_alpha.exp() * log_prob
             lasts = ~following[keys.TERMINATED][:, 0]
             target = following[keys.REWARD][:, 0] + GAMMA * lasts * value
-        q = self.critic(batch[keys.PIXELS], batch[keys.HOLDING], batch[keys.ACTION])
+        q = self.critic(batch[keys.DEPTH], batch[keys.HOLDING], batch[keys.ACTION])
         return 2 * F.mse_loss(q, target[:, None].expand_as(q))
 
     def actor_loss(self, batch: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return the policy term plus the behaviour term, and the log-probabilities [B]."""
         action, log_prob = self._sample(batch)
-        q = self.critic(batch[keys.PIXELS], batch[keys.HOLDING], action)
+        q = self.critic(batch[keys.DEPTH], batch[keys.HOLDING], action)
         policy = (self.log_alpha.exp().detach() * log_prob - q.amin(dim=1)).mean()
         errors = (action - batch[keys.ACTION]).square().mean(dim=1)
         is_demonstration = batch[keys.IS_DEMONSTRATION][:, 0]
@@ -242,7 +242,7 @@ class EscnnSACfD:
 
     def _sample(self, observation: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return actions [B, A], with gradient, and their log-probabilities [B]."""
-        gaussian = self.actor(observation[keys.PIXELS], observation[keys.HOLDING])
+        gaussian = self.actor(observation[keys.DEPTH], observation[keys.HOLDING])
         return compute_rsample_log_prob(UnitTanhNormal(*gaussian))
 
     def _step(self, name: str, loss: Tensor) -> None:

@@ -86,7 +86,9 @@ def _expert_episodes(
 ) -> tuple[float, list[TensorDict]]:
     """Return the image's largest value and the expert's episodes."""
     env = make_vector_env(task, 1, parallel=False, seed=SEED, expert=True, **settings)
-    high = float(env.observation_spec[keys.PIXELS].space.high.max())
+    specs = env.observation_spec
+    image = specs[keys.DEPTH if keys.DEPTH in specs else keys.HEIGHTMAP]
+    high = float(image.space.high.max())
     played = collect_demonstrations(env, episodes, seed=SEED)
     env.close()
     return high, played
@@ -284,7 +286,7 @@ def close_loop_memory(bench: Bench) -> list[Row]:
     return _replay_memory(
         bench,
         "close_loop/block_picking",
-        lambda high: {keys.PIXELS: DepthQuantizer(high)},
+        lambda high: {keys.DEPTH: DepthQuantizer(high)},
         Budget("3300", 50.0, None),
     )
 
@@ -295,6 +297,6 @@ def open_loop_memory(bench: Bench) -> list[Row]:
     return _replay_memory(
         bench,
         "open_loop/block_stacking",
-        lambda high: dict.fromkeys((keys.PIXELS, keys.IN_HAND), HalfPrecision(high)),
+        lambda high: dict.fromkeys((keys.HEIGHTMAP, keys.IN_HAND), HalfPrecision(high)),
         Budget("13000", 100.0, None),
     )

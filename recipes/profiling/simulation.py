@@ -99,7 +99,7 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
             physics.append(env.scene.world.steps - before)
             units.append(seconds(unit))
             state = result[keys.NEXT]
-    size = env.observation_spec[keys.PIXELS].shape[-1]
+    size = env.config.obs_size
     env.close()
     unit.world.close()
     of_step, of_reset = BUDGETS.get(task, BUDGETS.get(TASKS[task].control, (None, None)))

@@ -50,17 +50,17 @@ def test_the_imitated_action_is_transformed_with_the_scene(algorithm):
         algorithm, "asr", augmentation="cn", augmentation_order=4, batch_size=16, buffer_size=24
     )
     data = transitions(learner)
-    size = data["pixels"].shape[-1]
+    size = data["heightmap"].shape[-1]
     rows, columns = torch.arange(len(data)) + 2, 20 - torch.arange(len(data)) // 2
     target = data[keys.ACTION].clone()
     for i, low, high in ((1, 0.25, 0.65), (2, -0.2, 0.2)):
         target[:, i] = low + (high - low) * ((rows, columns)[i - 1] + 0.5) / size
     data[keys.TARGET_ACTION] = target
-    data["pixels"] = torch.zeros_like(data["pixels"])
-    data["pixels"][torch.arange(len(data)), 0, rows, columns] = 0.1
+    data["heightmap"] = torch.zeros_like(data["heightmap"])
+    data["heightmap"][torch.arange(len(data)), 0, rows, columns] = 0.1
     learner.extend(data)
     batch = learner.sample()
-    spots = batch["pixels"].flatten(1).argmax(dim=1)
+    spots = batch["heightmap"].flatten(1).argmax(dim=1)
     shown = torch.stack([spots // size, spots % size], dim=1)
     target = batch[keys.TARGET_ACTION][:, 1:3]
     chosen = ((target - torch.tensor([0.25, -0.2])) / 0.4 * size).floor().long()

@@ -112,8 +112,8 @@ def test_the_policy_acts_within_the_range_and_greedily_at_its_mode():
     assert (first.abs() <= 1).all()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(state.clone())[keys.ACTION]
-    pixels = learner.codecs["pixels"](state[keys.PIXELS])  # as the policy sees them
-    loc = learner.policy.policy[0](state.clone().set(keys.PIXELS, pixels))["loc"]
+    depth = learner.codecs["depth"](state[keys.DEPTH])  # as the policy sees them
+    loc = learner.policy.policy[0](state.clone().set(keys.DEPTH, depth))["loc"]
     torch.testing.assert_close(greedy, loc.tanh())
 
 

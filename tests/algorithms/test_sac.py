@@ -26,7 +26,7 @@ def demonstrations():
     env.close()
     return torch.cat(
         [
-            as_transitions(each, ["pixels"], is_demonstration=True, imitates="expert")
+            as_transitions(each, ["depth"], is_demonstration=True, imitates="expert")
             for each in episodes
         ]
     )
@@ -38,29 +38,29 @@ def test_the_policy_writes_nothing_but_the_action_for_any_batch_shape(network, s
     policy = build(network).policy
     observation = TensorDict(
         {
-            "pixels": torch.rand(*shape, 1, 64, 64) * DEPTH_M,
+            "depth": torch.rand(*shape, 1, 64, 64) * DEPTH_M,
             "holding": torch.ones(*shape, 1, dtype=torch.bool),
         },
         batch_size=shape,
     )
     out = policy(observation)
-    assert set(out.keys()) == {"pixels", "holding", "action"}
+    assert set(out.keys()) == {"depth", "holding", "action"}
     assert out["action"].shape == (*shape, 5)
     assert (out["action"].abs() <= 1).all()
 
 
 def test_the_policy_acts_on_quantised_depth():
     sac = build()
-    codec = sac.codecs["pixels"]
+    codec = sac.codecs["depth"]
     codes = torch.randint(0, 256, (4, 1, 64, 64), dtype=torch.uint8)
     stored = codec.decode(codes)
     nearby = (stored + (torch.rand_like(stored) - 0.5) * 1.9 * codec.max_error_m).clamp(0)
     holding = torch.zeros(4, 1, dtype=torch.bool)
     actions = []
-    for pixels in (stored, nearby):
-        assert not torch.equal(pixels, stored) or pixels is stored
+    for depth in (stored, nearby):
+        assert not torch.equal(depth, stored) or depth is stored
         with set_exploration_type(ExplorationType.DETERMINISTIC):
-            td = TensorDict({"pixels": pixels, "holding": holding}, batch_size=[4])
+            td = TensorDict({"depth": depth, "holding": holding}, batch_size=[4])
             actions.append(sac.policy(td)["action"])
     assert torch.equal(*actions)
 
@@ -69,7 +69,7 @@ def test_the_acting_policy_follows_the_learner(demonstrations):
     sac = build("equi")
     sac.extend(demonstrations)
     td = TensorDict(
-        {"pixels": torch.rand(1, 1, 64, 64) * DEPTH_M, "holding": torch.zeros(1, 1).bool()},
+        {"depth": torch.rand(1, 1, 64, 64) * DEPTH_M, "holding": torch.zeros(1, 1).bool()},
         batch_size=[1],
     )
     with set_exploration_type(ExplorationType.DETERMINISTIC):

@@ -18,7 +18,7 @@ from ba_torchrl.errors import ConfigError
 from tests.algorithms import tiny
 from tests.algorithms.tiny import SIX_DOF
 
-IMAGES = ["pixels", "in_hand"]
+IMAGES = ["heightmap", "in_hand"]
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
 
@@ -102,16 +102,16 @@ def test_the_actions_of_the_episodes_are_on_the_grid(pose_episodes):
 
 def test_the_policy_acts_on_half_precision_heights(transitions):
     algorithm = build()
-    state = transitions[:6].select("pixels", "in_hand", "holding")
+    state = transitions[:6].select("heightmap", "in_hand", "holding")
     stored = state.clone()
-    stored["pixels"] = state["pixels"].half().float()
+    stored["heightmap"] = state["heightmap"].half().float()
     nearby = stored.clone()
-    nearby["pixels"] = stored["pixels"] * (1 + 2.0**-13)
+    nearby["heightmap"] = stored["heightmap"] * (1 + 2.0**-13)
     assert torch.equal(algorithm.policy(nearby)["action"], algorithm.policy(stored)["action"])
 
 
 def test_the_policy_is_greedy_unless_epsilon_is_positive(transitions):
-    state = transitions[:6].select("pixels", "in_hand", "holding")
+    state = transitions[:6].select("heightmap", "in_hand", "holding")
     with set_exploration_type(ExplorationType.RANDOM):
         greedy = build()
         first, second = (greedy.policy(state.clone())["action"] for _ in range(2))
@@ -182,7 +182,7 @@ def test_a_yaw_that_wraps_reverses_the_image_of_what_is_held_and_negates_tilts(y
     empty = torch.zeros_like(image)
     states = TensorDict(
         {
-            "pixels": torch.zeros(4, 1, 32, 32),
+            "heightmap": torch.zeros(4, 1, 32, 32),
             "in_hand": torch.stack([empty, image, image, empty]),
             "holding": torch.tensor([False, True, True, False])[:, None],
         },

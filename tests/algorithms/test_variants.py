@@ -96,7 +96,7 @@ def test_a_restored_learner_continues_the_same_views(preset):
     second.load_state_dict(first.state_dict())
     second.replay.set_rng(torch.Generator().manual_seed(3))
     first.replay.set_rng(torch.Generator().manual_seed(3))
-    assert torch.equal(first.sample()[keys.PIXELS], second.sample()[keys.PIXELS])
+    assert torch.equal(first.sample()[keys.DEPTH], second.sample()[keys.DEPTH])
 
 
 def test_the_options_reach_augmentation_loss_and_target_update():
@@ -256,10 +256,10 @@ def test_the_acting_policy_sees_the_centre_of_larger_images():
     other = state.clone()
     border = torch.ones(IMAGE, IMAGE, dtype=torch.bool)
     border[3 : 3 + CROP, 3 : 3 + CROP] = False
-    other[keys.PIXELS][..., border] = 0.1
+    other[keys.DEPTH][..., border] = 0.1
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         first, second = ferm.policy(state)[keys.ACTION], ferm.policy(other)[keys.ACTION]
-        other[keys.PIXELS][..., ~border] = 0.1
+        other[keys.DEPTH][..., ~border] = 0.1
         assert torch.equal(first, second)
         assert not torch.equal(first, ferm.policy(other)[keys.ACTION])
 

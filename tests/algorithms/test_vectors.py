@@ -12,7 +12,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
 from tests.algorithms import tiny
 
-SIZES = {"proprio": 8, "joint_positions": 7}
+SIZES = {"proprio": 8, "joints": 7}
 DRQ = {"view_transform": "shift", "views": 2, "target_views": 2}
 
 
@@ -26,12 +26,12 @@ def build(network="cnn", vectors=tuple(SIZES), algorithm="sac", observed=SIZES, 
 @pytest.mark.parametrize(
     ("network", "vectors", "algorithm", "settings"),
     [
-        ("cnn", ("joint_positions", "proprio"), "sac", {}),
+        ("cnn", ("joints", "proprio"), "sac", {}),
         ("cnn", ("proprio",), "sac", DRQ),
         ("cnn", ("proprio",), "rlpd", {}),
         ("cnn", ("proprio",), "iql", {}),
         ("cnn", ("proprio",), "bc", {}),
-        ("ferm", ("proprio", "joint_positions"), "sac", tiny.FERM),
+        ("ferm", ("proprio", "joints"), "sac", tiny.FERM),
         ("equi", ("proprio",), "sac", {"encoder_tau": 0.5}),
         ("equi", ("proprio",), "rlpd", {}),
     ],
@@ -47,7 +47,7 @@ def test_updates_and_actions_depend_on_the_vectors(network, vectors, algorithm, 
         rows = (sampled[key][:, None] == data[key]).all(-1).nonzero()[:, 1]
         assert torch.equal(sampled[keys.NEXT, key], data[keys.NEXT, key][rows])
     learner.update()
-    assert learner.policy.in_keys == ["pixels", "holding", *vectors]
+    assert learner.policy.in_keys == ["depth", "holding", *vectors]
     state = data[:2].select(*learner.policy.in_keys)
     action = learner.policy(state.clone())[keys.ACTION]
     for key in vectors:
@@ -89,6 +89,6 @@ def test_a_run_stores_demonstrations_with_vectors_and_its_policy_is_loaded(tmp_p
     state = envs.reset(seed=1)
     seen = learner.policy(state.clone())[keys.ACTION]
     assert policy(state)[keys.ACTION].shape == seen.shape
-    assert policy.in_keys == ["pixels", "holding", *SIZES]
+    assert policy.in_keys == ["depth", "holding", *SIZES]
     assert policy.env_config["observations"] == tuple(env["observations"])
     envs.close()

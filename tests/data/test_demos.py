@@ -95,11 +95,15 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     assert len(load_demonstrations(tmp_path, task=TASK, env=ENV)) == len(episodes)
     with pytest.raises(ConfigError, match="object_type: collected with 'cube', needed 'cylinder'"):
         load_demonstrations(tmp_path, task=TASK, env={**ENV, "object_type": "cylinder"})
-    del metadata["task"]
-    file.write_text(json.dumps(metadata))
-    seal(tmp_path)
-    with pytest.raises(ConfigError, match="does not say what was collected"):
-        load_demonstrations(tmp_path, task=TASK, env=ENV)
+    for name, message in (
+        ("format", "key pixels is now depth in close loop.*; collect"),
+        ("task", "does not say what was collected"),
+    ):
+        del metadata[name]
+        file.write_text(json.dumps(metadata))
+        seal(tmp_path)
+        with pytest.raises(ConfigError, match=message):
+            load_demonstrations(tmp_path, task=TASK, env=ENV)
 
 
 @pytest.mark.parametrize(
@@ -179,11 +183,11 @@ def test_flags_are_those_of_the_transitions_and_of_a_file(noisy, tmp_path):
     loaded = load_demonstrations(tmp_path / "demos", task=NOISY_TASK, env=env)
     for episode, other in zip(episodes, loaded, strict=True):
         for each in (episode, other):
-            stored = as_transitions(each, [keys.PIXELS], is_demonstration=True)
+            stored = as_transitions(each, [keys.DEPTH], is_demonstration=True)
             assert torch.equal(stored[keys.IS_DEMONSTRATION], episode[keys.IS_EXPERT])
             assert keys.TARGET_ACTION not in stored
             labelled = as_transitions(
-                each, [keys.PIXELS], is_demonstration=True, imitates="expert_everywhere"
+                each, [keys.DEPTH], is_demonstration=True, imitates="expert_everywhere"
             )
             assert labelled[keys.IS_DEMONSTRATION].all()
             assert torch.equal(labelled[keys.TARGET_ACTION], episode[keys.EXPERT_ACTION])
@@ -192,11 +196,11 @@ def test_flags_are_those_of_the_transitions_and_of_a_file(noisy, tmp_path):
 
 def test_without_labels_only_the_steps_of_the_expert_are_imitated(noisy):
     episode = noisy[0][0].exclude(keys.EXPERT_ACTION)
-    stored = as_transitions(episode, [keys.PIXELS], is_demonstration=True, imitates="expert")
+    stored = as_transitions(episode, [keys.DEPTH], is_demonstration=True, imitates="expert")
     assert torch.equal(stored[keys.IS_DEMONSTRATION], episode[keys.IS_EXPERT])
     assert torch.equal(stored[keys.TARGET_ACTION], episode[keys.ACTION])
     with pytest.raises(KeyError, match="expert_action"):
-        as_transitions(episode, [keys.PIXELS], is_demonstration=False, imitates="expert_everywhere")
+        as_transitions(episode, [keys.DEPTH], is_demonstration=False, imitates="expert_everywhere")
 
 
 def test_labels_of_demonstrations_are_actions_that_the_policy_can_choose():

@@ -54,11 +54,11 @@ def test_episodes_are_whole_and_repeat_with_the_seed(expert_env):
     again = collect_demonstrations(expert_env, 5, seed=3)
     other = collect_demonstrations(expert_env, 5, seed=30)
     for a, b in zip(first, again, strict=True):
-        assert torch.equal(a["pixels"], b["pixels"])
+        assert torch.equal(a["depth"], b["depth"])
         assert a["step_count"].flatten().tolist() == list(range(len(a)))
         assert a["next", "done"].flatten().tolist() == [False] * (len(a) - 1) + [True]
-        assert torch.equal(a["pixels"][1:], a["next", "pixels"][:-1])
-    assert not torch.equal(first[0]["pixels"][0], other[0]["pixels"][0])
+        assert torch.equal(a["depth"][1:], a["next", "depth"][:-1])
+    assert not torch.equal(first[0]["depth"][0], other[0]["depth"][0])
 
 
 def test_results_without_observations(expert_env):
@@ -72,10 +72,10 @@ def test_results_without_observations(expert_env):
 
 def test_transitions_are_flat_and_flagged(expert_env):
     (episode,) = collect_demonstrations(expert_env, 1, seed=0)
-    out = as_transitions(episode, ["pixels"], is_demonstration=True)
+    out = as_transitions(episode, ["depth"], is_demonstration=True)
     assert out.batch_size == (len(episode),)
     assert out["is_demonstration"].all()
-    assert set(out.keys()) == {"pixels", "holding", "action", "next", "is_demonstration"}
+    assert set(out.keys()) == {"depth", "holding", "action", "next", "is_demonstration"}
 
 
 def test_episodes_with_faults_are_replaced(expert_env, monkeypatch):

@@ -46,7 +46,7 @@ PATHS = {
     "lerobot": "picking",
 }
 SHAPES = {
-    "pixels": ((1, SIZE, SIZE), torch.float32),
+    "depth": ((1, SIZE, SIZE), torch.float32),
     "in_hand": ((3, 24, 24), torch.float32),
     "wrist_rgb": ((3, 48, 48), torch.uint8),
     "segmentation": ((1, SIZE, SIZE), torch.int32),
@@ -137,11 +137,11 @@ def test_every_value_comes_back(name, episodes, tmp_path):
     ).read_text()
     assert f"| `{card.entries['proprio'].name}` | observation `proprio` | float32 | [8] |" in page
     image = [1, SIZE, SIZE] if name == "lerobot" else [SIZE, SIZE, 1]
-    assert f"| `{card.entries['pixels'].name}` | observation `pixels` | float32 | {image} |" in page
+    assert f"| `{card.entries['depth'].name}` | observation `depth` | float32 | {image} |" in page
     reward = [] if name == "hdf5" else [1]
     assert f"| result `reward` | float32 | {reward} |" in page
     assert ("LeRobot" in page) == (name == "lerobot")
-    assert card.entries["pixels"].shape == (1, SIZE, SIZE)
+    assert card.entries["depth"].shape == (1, SIZE, SIZE)
 
 
 @pytest.mark.parametrize("name", ["minari", "hdf5", "zarr", "lerobot"])
@@ -203,12 +203,12 @@ def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     dataset = minari.load_dataset(PATHS["minari"])
     env = dataset.recover_environment()
-    assert env.observation_space["pixels"] == dataset.observation_space["pixels"]
+    assert env.observation_space["depth"] == dataset.observation_space["depth"]
     assert env.spec.id == "BulletArm/CloseLoopBlockPicking-v0"
     env.reset(seed=0)
     first = next(iter(dataset.iterate_episodes()))
-    for action, pixels in zip(first.actions, first.observations["pixels"][1:], strict=True):
-        np.testing.assert_array_equal(env.step(action)[0]["pixels"], pixels)
+    for action, depth in zip(first.actions, first.observations["depth"][1:], strict=True):
+        np.testing.assert_array_equal(env.step(action)[0]["depth"], depth)
     env.close()
 
 
@@ -221,7 +221,7 @@ def test_torchrl_reads_what_minari_wrote(collected, tmp_path, monkeypatch):
         PATHS["minari"], batch_size=4, root=tmp_path / "torchrl", load_from_local_minari=True
     )[:]
     steps = torch.cat(collected)
-    ours = [("pixels",), ("holding",), ("next", "pixels"), ("next", "holding")]
+    ours = [("depth",), ("holding",), ("next", "depth"), ("next", "holding")]
     theirs = [(*key[:-1], "observation", key[-1]) for key in ours]
     same = [("action",), ("next", "reward"), ("next", "terminated"), ("next", "truncated")]
     for key, name in zip([*ours, *same], [*theirs, *same], strict=True):
@@ -276,7 +276,7 @@ def test_nested_observations_and_infos_of_minari_are_mapped(rows, tmp_path, monk
         action_space=spaces.Box(-1, 1, (5,), np.float64),
     )
     mapping = {
-        "pixels": "observations/arm/depth",
+        "depth": "observations/arm/depth",
         "holding": "observations/arm/grip",
         "action": "actions",
         "success": "infos/won/all",
@@ -284,7 +284,7 @@ def test_nested_observations_and_infos_of_minari_are_mapped(rows, tmp_path, monk
     options = {"task": TASK, "env": ENV, "mapping": mapping}
     check_demonstrations(tmp_path / "theirs-v0", **options)
     (found,) = load_demonstrations(tmp_path / "theirs-v0", **options)
-    np.testing.assert_array_equal(found["next", "pixels"][:, 0], depth[1:])
+    np.testing.assert_array_equal(found["next", "depth"][:, 0], depth[1:])
     assert found["holding"].flatten().tolist() == [False, False, True]
     assert found["next", "success"].flatten().tolist() == [False, False, True]
 
@@ -317,14 +317,14 @@ def test_lerobot_has_its_names(episodes, tmp_path):
     features = info["features"]
     assert features["observation.state"]["shape"] == [8]
     assert features["observation.images.wrist_rgb"]["dtype"] == "image"
-    assert features["observation.images.pixels"]["info"]["is_depth_map"]
+    assert features["observation.images.depth"]["info"]["is_depth_map"]
     assert {"action", "next.reward", "next.done", "next.success"} <= features.keys()
 
 
 # Another robot's teleoperation: depth in millimetres with channels last, an action of
 # (x, y, z, yaw, gripper) in metres, radians and opening.
 FOREIGN = {
-    "pixels": {"source": "obs/depth", "scale": 0.001},
+    "depth": {"source": "obs/depth", "scale": 0.001},
     "holding": {"source": "obs/state", "components": [1], "scale": -1, "offset": 1},
     "action": {
         "source": "actions",
@@ -362,8 +362,8 @@ def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
         demo = file["data/demo_0"]
         depth, action = demo["obs/depth"][:], demo["actions"][:]
     pixels = torch.from_numpy(depth.transpose(0, 3, 1, 2) * 0.001).float()
-    assert torch.equal(first["pixels"], pixels)
-    assert torch.equal(first["next", "pixels"], torch.cat([pixels[1:], pixels[-1:]]))
+    assert torch.equal(first["depth"], pixels)
+    assert torch.equal(first["next", "depth"], torch.cat([pixels[1:], pixels[-1:]]))
     assert first["holding"].flatten().tolist() == [True, False, True]
     wanted = np.c_[action[:, 4] * 2 - 1, action[:, :3] * 20, action[:, 3]]
     np.testing.assert_allclose(first["action"], wanted, rtol=1e-6)
@@ -411,7 +411,7 @@ def test_an_episode_ends_at_its_first_success_or_end(
         f"{path}: 1 of 5 steps are left out, those after the first success or end of an episode"
     ]
     whole, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
-    assert torch.equal(first["next", "pixels"], whole["next", "pixels"][:2])
+    assert torch.equal(first["next", "depth"], whole["next", "depth"][:2])
     for each in (first, second):
         following = each["next"]
         assert following["done"].flatten().tolist() == [False, True]
@@ -485,7 +485,7 @@ def test_results_that_contradict_their_meaning_are_refused(results, message, tmp
         ({"gripper": "obs/state"}, "the environment has no gripper. Known: .*holding"),
         ({"holding": "obs/grip"}, "episode 0: holding: there is no 'obs/grip'. Known: .*obs/state"),
         ({"holding": "obs/state"}, r"holding: has the shape \[2\], needed \[1\]"),
-        ({"pixels": "obs/depth"}, r"pixels: has values from 0 to 199, needed .*; set scale"),
+        ({"depth": "obs/depth"}, r"depth: has values from 0 to 199, needed .*; set scale"),
         ({"action": {"source": "actions", "offset": -3}}, "action: has values from -2.99"),
         ({"action": {"source": "actions", "components": [9]}}, "action: actions.*out of bounds"),
         ({"action": {"source": "actions", "scale": [1, 2]}}, "action: actions.*broadcast"),
@@ -519,10 +519,10 @@ def test_depth_without_an_axis_of_channels_fits(tmp_path):
     with h5py.File(path, "a") as file:
         for demo in file["data"].values():
             demo["flat"] = demo["obs/depth"][..., 0]
-    mapping = {**FOREIGN, "pixels": {"source": "flat", "scale": 0.001}}
+    mapping = {**FOREIGN, "depth": {"source": "flat", "scale": 0.001}}
     check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
     found, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
-    assert torch.equal(found["pixels"], wanted["pixels"])
+    assert torch.equal(found["depth"], wanted["depth"])
 
 
 def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
@@ -534,7 +534,7 @@ def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
     found, _ = load_demonstrations(path, **options)
     assert_equal([found], [wanted])
     (tmp_path / "a.yaml").write_text(text.replace("1e-3", "1e-3m"))
-    with pytest.raises(ConfigError, match=r"pixels\.scale: .*could not convert string to float"):
+    with pytest.raises(ConfigError, match=r"depth\.scale: .*could not convert string to float"):
         load_demonstrations(path, **options)
 
 
@@ -568,7 +568,7 @@ def test_hdf5_is_read_where_it_is_mapped_and_checked_by_shapes(tmp_path, monkeyp
     check_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
     assert read == []
     for changes, message in (
-        ({"pixels": "obs/camera"}, r"pixels: has the shape \[1048576, 1048576\], needed"),
+        ({"depth": "obs/camera"}, r"depth: has the shape \[1048576, 1048576\], needed"),
         ({"success": "obs/nothing"}, "success has 0 rows, and there are 3 actions"),
         ({"reward": "obs/state"}, r"reward: has the shape \[2\], needed one number"),
         ({"instruction": "ep_meta/lang"}, "instruction: there is no 'ep_meta/lang'"),
@@ -678,7 +678,7 @@ def test_dense_rewards_are_not_made_up(tmp_path):
 
 def test_episodes_that_differ_are_not_exported(episodes, tmp_path):
     with pytest.raises(
-        ConfigError, match=r"episode 0: pixels .*\[1, 64, 64\], needed \[1, 128, 128\]"
+        ConfigError, match=r"episode 0: depth .*\[1, 64, 64\], needed \[1, 128, 128\]"
     ):
         exported(tmp_path, episodes, "hdf5", env={})
     with pytest.raises(ConfigError, match="episode 1 has no steps"):
@@ -692,9 +692,10 @@ def test_episodes_that_differ_are_not_exported(episodes, tmp_path):
     ("damage", "message"),
     [
         (lambda card: card["entries"].pop("action"), "is damaged: .*entries lack action"),
-        (lambda card: card["entries"]["pixels"].update(dtype="foo"), "pixels has the unknown type"),
-        (lambda card: card["entries"]["pixels"].update(dtype="O"), "pixels has the unknown type"),
+        (lambda card: card["entries"]["depth"].update(dtype="foo"), "depth has the unknown type"),
+        (lambda card: card["entries"]["depth"].update(dtype="O"), "depth has the unknown type"),
         (lambda card: card.update(seed="x"), "is damaged: seed: "),
+        (lambda card: card.pop("card_format"), "key pixels is now depth .*; export again"),
         (lambda card: card.update(episodes=7), "holds 3 episodes, its card says 7"),
         (lambda card: card["entries"]["proprio"].update(name="no"), "episode 0: .* no 'no', which"),
     ],
@@ -764,7 +765,7 @@ def foreign_zarr(path, version=2, **changes):
 
 
 ZARR = {
-    "pixels": "camera/depth",
+    "depth": "camera/depth",
     "holding": {"source": "state", "components": [1]},
     "action": "action",
     "success": "success",
@@ -791,8 +792,8 @@ def test_groups_and_archives_of_zarr_are_read(version, is_zip, tmp_path):
     path = zipped(path) if is_zip else path
     check_demonstrations(path, task=TASK, env=ENV, least=2, mapping=ZARR)
     first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)
-    np.testing.assert_array_equal(first["pixels"][:, 0], depth[:3])
-    np.testing.assert_array_equal(second["pixels"][:, 0], depth[3:])
+    np.testing.assert_array_equal(first["depth"][:, 0], depth[:3])
+    np.testing.assert_array_equal(second["depth"][:, 0], depth[3:])
     assert first["next", "success"].flatten().tolist() == [False, False, True]
     assert not second["next", "success"].any()
     with pytest.raises(ConfigError, match=r"data/note has the shape \[7\], the episodes end at"):
@@ -897,7 +898,7 @@ def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
     (tmp_path / "b.yaml").write_text("- a\n- b\n")
     with pytest.raises(ConfigError, match=r"b\.yaml: must map keys to names"):
         load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "b.yaml")
-    (tmp_path / "d.yaml").write_text("pixels: [1,\naction: b\n")
+    (tmp_path / "d.yaml").write_text("depth: [1,\naction: b\n")
     with pytest.raises(ConfigError, match=r"d\.yaml: .* line 3"):
         load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "d.yaml")
     with pytest.raises(ConfigError, match=r"no demonstrations at .*in the formats"):

@@ -42,7 +42,7 @@ def taken_apart():
     """A synthetic episode of two picks and places, in which images of state t have the value t."""
     return TensorDict(
         {
-            "pixels": images(0, 1, 2, 3),
+            "heightmap": images(0, 1, 2, 3),
             "in_hand": images(0, 101, 0, 103),
             "holding": flags(False, True, False, True),
             "expert_action": torch.zeros(4, 2),
@@ -57,7 +57,7 @@ def taken_apart():
             "truncated": flags(False, False, False, False),
             "step_count": flags(0, 1, 2, 3),
             "next": {
-                "pixels": images(1, 2, 3, 4),
+                "heightmap": images(1, 2, 3, 4),
                 "in_hand": images(101, 0, 103, 0),
                 "holding": flags(True, False, True, False),
                 "expert_action": torch.zeros(4, 2),
@@ -79,8 +79,8 @@ def taken_apart():
 
 def test_observations_are_in_reverse_order(taken_apart):
     built = reverse_episode(taken_apart)
-    assert built["pixels"][:, 0, 0, 0].tolist() == [4, 3, 2, 1]
-    assert built["next", "pixels"][:, 0, 0, 0].tolist() == [3, 2, 1, 0]
+    assert built["heightmap"][:, 0, 0, 0].tolist() == [4, 3, 2, 1]
+    assert built["next", "heightmap"][:, 0, 0, 0].tolist() == [3, 2, 1, 0]
     assert built["action"].tolist() == [[0, 43], [1, 32], [0, 21], [1, 10]]
     assert built["holding"].flatten().tolist() == [False, True, False, True]
     assert built["next", "holding"].flatten().tolist() == [True, False, True, False]
@@ -108,8 +108,8 @@ def test_the_last_step_has_the_reward_and_ends(taken_apart):
 def test_the_original_episode_is_not_modified(taken_apart):
     before = taken_apart.clone()
     built = reverse_episode(taken_apart)
-    built["pixels"] = built["pixels"] + 1
-    built["next", "pixels"] = built["next", "pixels"] + 1
+    built["heightmap"] = built["heightmap"] + 1
+    built["next", "heightmap"] = built["next", "heightmap"] + 1
     assert (taken_apart == before).all()
 
 
@@ -244,7 +244,7 @@ def test_reversed_episodes_equal_their_replay_in_the_simulator(mode):
             assert played["success"] == step["next", "success"]
             assert played["reward"] == step["next", "reward"]
             # a pixel at an edge may fall to the other side
-            off = (played["pixels"] - step["next", "pixels"]).abs() > 3e-3
+            off = (played["heightmap"] - step["next", "heightmap"]).abs() > 3e-3
             assert off.float().mean() < 0.01
             if mode != "proj":
                 off = (played["in_hand"] - step["next", "in_hand"]).abs() > 3e-3
@@ -294,8 +294,8 @@ def test_episodes_are_collected_in_a_vector_of_environments():
         env.close()
     assert [len(episode) for episode in episodes] == [4, 4, 4]
     for episode, original in zip(episodes, played, strict=True):
-        assert torch.equal(episode["pixels"][0], original["next", "pixels"][-1])
-    transitions = as_transitions(episodes[0], ["pixels", "in_hand"], is_demonstration=True)
+        assert torch.equal(episode["heightmap"][0], original["next", "heightmap"][-1])
+    transitions = as_transitions(episodes[0], ["heightmap", "in_hand"], is_demonstration=True)
     assert keys.IN_HAND in transitions
     assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
 

@@ -10,7 +10,7 @@ from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_devi
 from ba_torchrl.envs import keys
 
 CPU, META = torch.device("cpu"), torch.device("meta")
-CODECS = {keys.PIXELS: DepthQuantizer(0.4), "heights": HalfPrecision(0.4), "camera": Uint8Images()}
+CODECS = {keys.DEPTH: DepthQuantizer(0.4), "heights": HalfPrecision(0.4), "camera": Uint8Images()}
 
 
 def transitions(count=20):
@@ -19,7 +19,7 @@ def transitions(count=20):
     def state():
         image = torch.rand(count, 1, 8, 8, generator=generator)
         camera = (255 * torch.rand(count, 3, 8, 8, generator=generator)).to(torch.uint8)
-        return {keys.PIXELS: 0.4 * image, "heights": 0.3 * image, "camera": camera}
+        return {keys.DEPTH: 0.4 * image, "heights": 0.3 * image, "camera": camera}
 
     expert = torch.arange(count)[:, None] % 3 == 0
     action = torch.rand(count, 4, generator=generator)
@@ -35,22 +35,22 @@ def test_codes_decoded_after_the_copy_are_the_images_of_the_replay(kind):
         replay.extend(transitions())
         samples.append(replay.sample())
     images, codes = samples
-    assert codes[keys.PIXELS].dtype == torch.uint8
-    assert images[keys.PIXELS].dtype == torch.float32
+    assert codes[keys.DEPTH].dtype == torch.uint8
+    assert images[keys.DEPTH].dtype == torch.float32
     decoded = decoded_on_device(codes, CODECS, CPU)
     assert set(decoded.keys(True, True)) == set(images.keys(True, True))
     for key in images.keys(True, True):
         torch.testing.assert_close(decoded[key], images[key], rtol=0, atol=0)
-    assert codes[keys.PIXELS].dtype == torch.uint8  # unchanged
+    assert codes[keys.DEPTH].dtype == torch.uint8  # unchanged
 
 
 def test_images_go_to_the_device_first_and_the_other_entries_last():
     batch = transitions()
-    batch.update({keys.PIXELS: CODECS[keys.PIXELS].encode(batch[keys.PIXELS])})
-    codecs = {keys.PIXELS: CODECS[keys.PIXELS]}
-    batch[keys.NEXT, keys.PIXELS] = batch[keys.PIXELS]
+    batch.update({keys.DEPTH: CODECS[keys.DEPTH].encode(batch[keys.DEPTH])})
+    codecs = {keys.DEPTH: CODECS[keys.DEPTH]}
+    batch[keys.NEXT, keys.DEPTH] = batch[keys.DEPTH]
     decoded = decoded_on_device(batch, codecs, META)
-    assert decoded[keys.PIXELS].device == decoded[keys.NEXT, keys.PIXELS].device == META
+    assert decoded[keys.DEPTH].device == decoded[keys.NEXT, keys.DEPTH].device == META
     assert decoded[keys.ACTION].device == CPU
     moved = batch_to_device(decoded, META)
     assert {value.device for value in moved.values(True, True)} == {META}

@@ -39,7 +39,7 @@ class FakeEnv(EnvBase):
         self.size = size
         self.work_s = work_s
         self.observation_spec = Composite(
-            pixels=Bounded(0, 1, shape=(1, size, size), dtype=torch.float32),
+            depth=Bounded(0, 1, shape=(1, size, size), dtype=torch.float32),
             holding=flag(),
             success=flag(),
             fault=flag(),
@@ -92,7 +92,7 @@ class FakeEnv(EnvBase):
 
     def _observe(self, **flags):
         out = {
-            "pixels": torch.rand(1, self.size, self.size, generator=self.generator),
+            "depth": torch.rand(1, self.size, self.size, generator=self.generator),
             "step_count": torch.tensor([self.count]),
             **{key: torch.tensor([False]) for key in ("holding", "success", "fault")},
             **{key: torch.tensor([flags.get(key, False)]) for key in FLAGS},
@@ -133,7 +133,7 @@ def act(env, td, value=0.1):
 def assert_lost(result, index, before):
     """Check that ``result`` reports the loss of one environment's episode after ``before``."""
     answer = result["next"][index]
-    assert torch.equal(answer["pixels"], before["pixels"][index])
+    assert torch.equal(answer["depth"], before["depth"][index])
     for key in ("fault", "truncated", "done"):
         assert answer[key].item(), key
     for key in ("success", "terminated"):
@@ -143,7 +143,7 @@ def assert_lost(result, index, before):
 
 def assert_stepped(result, index, before):
     answer = result["next"][index]
-    assert not torch.equal(answer["pixels"], before["pixels"][index])
+    assert not torch.equal(answer["depth"], before["depth"][index])
     assert answer["step_count"].item() == before["step_count"][index].item() + 1
     assert not answer["fault"].item()
     assert answer["reward"].item() == pytest.approx(0.2)

@@ -12,9 +12,9 @@ def ground_and_block(env, z):
     scene = env.scene
     x, y, _ = scene.task.block.position
     scene.controller.reset(((x, y, z), 0.0))
-    depth = env._images(scene)["pixels"][0]
+    depth = env._images(scene)["depth"][0]
     center = env.config.obs_size // 2
-    assert state["pixels"].shape == (1, env.config.obs_size, env.config.obs_size)
+    assert state["depth"].shape == (1, env.config.obs_size, env.config.obs_size)
     return depth.max(), depth[center, center]
 
 
@@ -33,7 +33,7 @@ def test_the_image_covers_45_centimetres_around_the_tool():
     scene = env.scene
     scene.controller.reset(((0.45, 0.0, 0.2), 0.0))
     scene.task.block.place((0.45 + 0.1, 0.0 - 0.05, 0.025), 0.0)
-    depth = env._images(scene)["pixels"][0]
+    depth = env._images(scene)["depth"][0]
     rows, cols = np.nonzero(np.isclose(depth, 0.32 - 0.05, atol=1e-6))
     # 5 mm per pixel; +x is down the rows, +y along the columns
     assert (rows.min(), rows.max()) == (45 + 15, 45 + 24)

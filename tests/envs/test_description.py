@@ -17,7 +17,7 @@ def test_a_description_holds_what_the_environment_has():
     env.reset()
     try:
         assert found.conditions == tuple(env.conditions)
-        assert found.observations["pixels"] == tuple(env.observation_spec["pixels"].shape)
+        assert found.observations["heightmap"] == tuple(env.observation_spec["heightmap"].shape)
         assert list(found.actions) == list(env.actions.components)
         assert found.actions["x"] == pytest.approx(env.config.workspace[0])
         assert found.max_steps == env.max_steps
@@ -57,7 +57,7 @@ def test_the_text_of_an_environment_names_task_robot_image_and_action():
     text = repr(env)
     env.close()
     assert text == (
-        "CloseLoopEnv(close_loop/block_reaching, panda, pixels 1 x 32 x 32, action pxyzr)"
+        "CloseLoopEnv(close_loop/block_reaching, panda, depth 1 x 32 x 32, action pxyzr)"
     )
     env = ba_torchrl.make("close_loop/block_reaching", obs_type="vec")
     assert "kuka, vec, action" in repr(env)

@@ -101,7 +101,7 @@ def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt
     assert following["reward"] == 0
     for key, value in following.items():
         assert torch.isfinite(value.float()).all(), key
-    assert torch.equal(following["pixels"], state["pixels"])  # the last valid observation
+    assert torch.equal(following["depth"], state["depth"])  # the last valid observation
     assert env.faults == 1
     with pytest.raises(SimulationError, match="reset the environment first"):
         _ = env.scene
@@ -119,7 +119,7 @@ def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
     fault(env)
     step(env, state)
     for other in expected[1:]:
-        assert torch.equal(env.reset()["pixels"], other["pixels"])
+        assert torch.equal(env.reset()["depth"], other["depth"])
     undisturbed.close()
     env.close()
 
@@ -134,7 +134,7 @@ def test_a_fault_between_two_episodes_starts_the_reset_again(task, fault):
     expected = undisturbed.reset()
     fault(env)
     state = env.reset()
-    assert torch.equal(state["pixels"], expected["pixels"])
+    assert torch.equal(state["depth"], expected["depth"])
     assert not step(env, state)["fault"]
     undisturbed.close()
     env.close()
@@ -220,15 +220,15 @@ def test_an_image_that_is_not_finite_is_a_fault(monkeypatch):
 
     def spoilt(scene):
         images = height_map(scene)
-        images["pixels"] = images["pixels"].copy()
-        images["pixels"][0, 3, 3] = math.nan
+        images["depth"] = images["depth"].copy()
+        images["depth"][0, 3, 3] = math.nan
         return images
 
     with monkeypatch.context() as patch:
         patch.setattr(env, "_images", spoilt)
         following = step(env, state)
     assert following["fault"]
-    assert torch.isfinite(following["pixels"]).all()
+    assert torch.isfinite(following["depth"]).all()
     env.close()
 
 

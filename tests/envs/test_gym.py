@@ -75,12 +75,12 @@ def test_stable_baselines_warns_about_nothing_but_the_range_of_depth(make, task)
 
 def test_spaces_match_the_specs(make):
     env = make(action_sequence="pxyz", expert=True)
-    assert set(env.observation_space) == {"pixels", "holding"}
-    pixels, spec = env.observation_space["pixels"], env.unwrapped.torchrl_env.observation_spec
-    assert pixels.shape == (1, 16, 16)
-    assert pixels.dtype == np.float32
-    assert pixels.low.tolist() == spec["pixels"].low.tolist()
-    assert pixels.high.tolist() == spec["pixels"].high.tolist()
+    assert set(env.observation_space) == {"depth", "holding"}
+    depth, spec = env.observation_space["depth"], env.unwrapped.torchrl_env.observation_spec
+    assert depth.shape == (1, 16, 16)
+    assert depth.dtype == np.float32
+    assert depth.low.tolist() == spec["depth"].low.tolist()
+    assert depth.high.tolist() == spec["depth"].high.tolist()
     assert env.observation_space["holding"] == spaces.MultiBinary(1)
     assert env.action_space == spaces.Box(-1, 1, (4,), np.float32)
 
@@ -151,7 +151,7 @@ def test_episodes_are_those_of_torchrl(make):
         state = reference.reset()
         observation, info = env.reset(seed=seed)
         for _ in range(3):
-            assert np.array_equal(observation["pixels"], state["pixels"].numpy())
+            assert np.array_equal(observation["depth"], state["depth"].numpy())
             assert np.array_equal(info["expert_action"], state["expert_action"].numpy())
             state = reference.step(state.set("action", state["expert_action"]))["next"]
             observation, *_, info = env.step(info["expert_action"])
@@ -283,7 +283,7 @@ def test_torchrl_wraps_it(make):
 
     env = GymEnv(gym_id("close_loop/block_reaching"), obs_size=32, seed=0)
     rollout = env.rollout(3)
-    assert rollout["pixels"].shape == (3, 1, 32, 32)
+    assert rollout["depth"].shape == (3, 1, 32, 32)
     env.close()
 
 

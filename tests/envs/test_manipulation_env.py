@@ -68,8 +68,8 @@ def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel():
         )
         rollouts.append(env.rollout(6, policy, break_when_any_done=False))
         env.close()
-    assert torch.equal(rollouts[0]["next", "pixels"], rollouts[1]["next", "pixels"])
-    assert not torch.equal(rollouts[0]["pixels"][0, 0], rollouts[0]["pixels"][1, 0])
+    assert torch.equal(rollouts[0]["next", "depth"], rollouts[1]["next", "depth"])
+    assert not torch.equal(rollouts[0]["depth"][0, 0], rollouts[0]["depth"][1, 0])
 
 
 def test_a_simulator_fault_ends_the_episode_truncated(env, monkeypatch, caplog):
@@ -114,7 +114,7 @@ def test_collectors_reset_each_environment_on_its_own():
         for t in range(19):
             assert starts[t + 1] == (0 if done[t] else counts[t])
             if not done[t]:
-                assert torch.equal(row["pixels"][t + 1], row["next", "pixels"][t])
+                assert torch.equal(row["depth"][t + 1], row["next", "depth"][t])
         assert max(counts) <= 7
 
 

@@ -44,10 +44,10 @@ def test_all_observations_together_follow_their_specs(make):
     env = make("open_loop/house_building_2", *names, rgb=True, camera_size=40)
     check_env_specs(env)
     state = env.reset()
-    assert state["pixels"].shape == (1, 32, 32)
+    assert state["depth"].shape == (1, 32, 32)
     assert state["rgb"].shape == state["wrist_rgb"].shape == (3, 40, 40)
     assert state["rgb_depth"].shape == state["segmentation"].shape == (1, 40, 40)
-    assert env.vectors == {"proprio": 8, "joint_positions": 7}
+    assert env.vectors == {"proprio": 8, "joints": 7}
 
 
 def test_proprioception_is_the_tools_pose_and_the_opening(make):
@@ -61,7 +61,7 @@ def test_proprioception_is_the_tools_pose_and_the_opening(make):
         rotations = (quaternion_matrix(each.orientation) for each in (seen, tool))
         np.testing.assert_allclose(*rotations, atol=1e-6)
         assert opening == pytest.approx(robot.opening())
-        assert state["joint_positions"].tolist() == pytest.approx(robot.measured_joints())
+        assert state["joints"].tolist() == pytest.approx(robot.measured_joints())
         state = follow_expert(env, state)
     assert opening < 0.9
 
@@ -225,7 +225,7 @@ def test_gymnasium_has_the_instruction_in_info():
     try:
         observation, info = env.reset(seed=0)
         assert info["instruction"] == env.instruction == "pick up the red block"
-        assert set(observation) == {"pixels", "holding", "proprio"}
+        assert set(observation) == {"depth", "holding", "proprio"}
         assert env.step(env.action_space.sample())[-1]["instruction"] == "pick up the red block"
         assert env.observation_space.contains(observation)
     finally:

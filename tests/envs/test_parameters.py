@@ -85,11 +85,11 @@ def test_object_scale_range_sets_the_size(make):
 def test_obs_size_and_view_scale(make):
     for size in (32, 50):
         env = make(obs_size=size)
-        assert env.reset()[keys.PIXELS].shape == (1, size, size)
+        assert env.reset()[keys.DEPTH].shape == (1, size, size)
     tops = []
     for view_scale in (1.0, 2.0):
         env = make(obs_size=128, view_scale=view_scale)
-        depth = env.reset()[keys.PIXELS]
+        depth = env.reset()[keys.DEPTH]
         tops.append(int(((depth < depth.max() - 0.03) & (depth > 0)).sum()))
     assert tops[0] == pytest.approx(4 * tops[1], rel=0.15)  # half the width, four times the area
 
@@ -236,7 +236,7 @@ def test_environments_are_made_from_resolved_parameters(make):
     assert (env.config.obs_size, env.max_steps) == (32, 14)  # the default of eight blocks
     env.close()
     vector = ba_torchrl.make_vector_env(resolved, 2, parallel=False, max_steps=3)
-    assert vector.reset()["pixels"].shape == (2, 1, 32, 32)
+    assert vector.reset()["depth"].shape == (2, 1, 32, 32)
     vector.close()
     named = resolve_env(PICKING, {}, modules=["json"])
     assert pickle.loads(pickle.dumps(named)).modules == named.changed(seed=1).modules == ("json",)
@@ -255,7 +255,7 @@ def test_the_step_limit_grows_with_the_number_of_blocks(make):
 
 def test_close_loop_tray_raises_the_objects_and_is_visible(make):
     env, plain = make(close_loop_tray=True, obs_size=64), make(obs_size=64)
-    depths = env.reset()[keys.PIXELS], plain.reset()[keys.PIXELS]
+    depths = env.reset()[keys.DEPTH], plain.reset()[keys.DEPTH]
     assert env.scene.task.block.position[2] == pytest.approx(0.027, abs=5e-4)
     assert plain.scene.task.block.position[2] == pytest.approx(0.025, abs=5e-4)
     assert not torch.equal(*depths)
@@ -289,7 +289,7 @@ def test_dpos_and_drot_bound_an_action(make):
 def test_obs_type_vec_lists_scaled_poses(make):
     env = make("close_loop/block_pushing", obs_type="vec")
     state = env.reset()
-    assert keys.PIXELS not in state
+    assert keys.DEPTH not in state
     task, robot = env.scene.task, env.scene.robot
     expected = [2 * robot.opening() - 1]
     for position, yaw in (
@@ -308,11 +308,11 @@ def test_view_types_show_the_same_scene_differently(make):
     images = {}
     for view in VIEWS:
         env = make("close_loop/block_pushing", view_type=view)
-        spec = env.observation_spec[keys.PIXELS]
+        spec = env.observation_spec[keys.DEPTH]
         state = act(env, env.reset(), x=0.6, r=0.7)
-        assert state[keys.PIXELS].shape == (VIEWS[view].channels, 32, 32)
-        assert spec.is_in(state[keys.PIXELS])
-        images[view] = state[keys.PIXELS]
+        assert state[keys.DEPTH].shape == (VIEWS[view].channels, 32, 32)
+        assert spec.is_in(state[keys.DEPTH])
+        images[view] = state[keys.DEPTH]
     # what lies on the floor is as high seen from a fixed camera as from one on the gripper
     depths = [image for name, image in images.items() if not name.endswith("_height")]
     heights = [images[f"camera_center_{axes}_height"] for axes in ("xyz", "xyzr", "z")]
@@ -377,8 +377,8 @@ def test_physics_mode_sets_up_the_engine(make, settings, time_step_s, iterations
 def test_colours_of_floor_and_workspace_affect_rgb_images_only(make):
     plain = make()
     colored = make(floor_color=(1.0, 1.0, 1.0), workspace_color=(0.1, 0.1, 0.1))
-    pixels = plain.reset()[keys.PIXELS], colored.reset()[keys.PIXELS]
-    assert torch.equal(*pixels)
+    depth = plain.reset()[keys.DEPTH], colored.reset()[keys.DEPTH]
+    assert torch.equal(*depth)
     before, after = plain.render(), colored.render()
     assert before.shape == after.shape
     assert (before != after).any(axis=-1).mean() > 0.2

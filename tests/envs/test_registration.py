@@ -83,6 +83,6 @@ def test_make_needs_no_import_of_the_package(tmp_path):
         f"env = gymnasium.make('ba_torchrl:{PICKING}', obs_size=16)\n"
         "observation, info = env.reset(seed=0)\n"
         "env.close()\n"
-        "print(json.dumps([light, observation['pixels'].shape]))"
+        "print(json.dumps([light, observation['depth'].shape]))"
     )
     assert run(code, tmp_path) == [True, [1, 16, 16]]

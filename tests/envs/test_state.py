@@ -122,11 +122,11 @@ def test_states_and_episodes_do_not_depend_on_earlier_motion(task, seed):
 @pytest.mark.parametrize("task", ["open_loop/object_grasping", "close_loop/object_grasping"])
 def test_a_state_of_a_heap_survives_another_seed(task):
     env = ba_torchrl.make(task, obs_size=32, seed=0)
-    first = env.reset()["pixels"]
+    first = env.reset()["depth"]
     kept = env.get_state()
     env.set_seed(1)
-    assert not torch.equal(env.reset()["pixels"], first)
-    assert torch.equal(env.set_state(kept)["pixels"], first)
+    assert not torch.equal(env.reset()["depth"], first)
+    assert torch.equal(env.set_state(kept)["depth"], first)
     env.close()
 
 
@@ -143,7 +143,7 @@ def test_an_action_can_be_undone_by_restoring_the_state():
         b = plain.step(b.set("action", b["expert_action"]))["next"]
         assert (a == b).all()
     assert a["success"]
-    assert torch.equal(tried.reset()["pixels"], plain.reset()["pixels"])  # the next episode, too
+    assert torch.equal(tried.reset()["depth"], plain.reset()["depth"])  # the next episode, too
     tried.close()
     plain.close()
 
@@ -229,14 +229,14 @@ def test_a_copy_is_an_independent_environment_in_the_same_state(task):
 def test_copies_without_a_scene_play_the_same_episodes(name):
     env = ba_torchrl.make("close_loop/block_picking", obs_size=32)  # with a random seed
     other = COPIES[name](env)
-    assert torch.equal(env.reset()["pixels"], other.reset()["pixels"])
+    assert torch.equal(env.reset()["depth"], other.reset()["depth"])
     env.step(env.reset().set("action", torch.zeros(5)))
     env.close()
     last = COPIES[name](env)
     other.reset()
-    first = env.reset()["pixels"]
+    first = env.reset()["depth"]
     for copied in (last, other):
-        assert torch.equal(copied.reset()["pixels"], first)
+        assert torch.equal(copied.reset()["depth"], first)
         copied.close()
     env.close()
 
@@ -248,7 +248,7 @@ def test_a_copy_after_a_fault_plays_the_next_episode():
     assert env.step(state.set("action", torch.zeros(5)))["next", "fault"]
     other = copy.deepcopy(env)
     assert other.conditions == env.conditions
-    assert torch.equal(other.reset()["pixels"], env.reset()["pixels"])
+    assert torch.equal(other.reset()["depth"], env.reset()["depth"])
     env.close()
     other.close()
 
@@ -290,9 +290,9 @@ def test_a_copy_of_a_gymnasium_environment_is_independent(name):
     env.reset(seed=0)
     other = COPIES[name](env)
     down = torch.tensor([1.0, 0.0, 0.0, -1.0, 0.0]).numpy()
-    first = other.step(down)[0]["pixels"]
-    assert (other.step(down)[0]["pixels"] != first).any()
-    assert (env.step(down)[0]["pixels"] == first).all()
+    first = other.step(down)[0]["depth"]
+    assert (other.step(down)[0]["depth"] != first).any()
+    assert (env.step(down)[0]["depth"] == first).all()
     env.close()
     other.close()
 
@@ -303,9 +303,9 @@ def test_a_copy_of_a_vector_is_independent(name):
     env = ba_torchrl.make_vector_env("close_loop/block_picking", 2, **options)
     state = env.reset().set("action", torch.tensor([[1.0, 0.0, 0.0, -1.0, 0.0]] * 2))
     other = COPIES[name](env)
-    first = other.step(state.clone())["next", "pixels"]
+    first = other.step(state.clone())["next", "depth"]
     other.step(state.clone())
-    assert torch.equal(env.step(state.clone())["next", "pixels"], first)
+    assert torch.equal(env.step(state.clone())["next", "depth"], first)
     env.close()
     other.close()
 
@@ -318,7 +318,7 @@ def test_a_copy_of_a_vector_continues_over_the_ends_of_episodes(name):
     other = COPIES[name](env)
     state["_reset"] = torch.tensor([[True], [False]])
     first, second = (each.reset(state.clone()) for each in (env, other))
-    assert torch.equal(first["pixels"], second["pixels"])
+    assert torch.equal(first["depth"], second["depth"])
     assert first["step_count"].flatten().tolist() == [0, 1]
     for _ in range(7):
         taken = []
@@ -326,9 +326,9 @@ def test_a_copy_of_a_vector_continues_over_the_ends_of_episodes(name):
             here["action"] = torch.full((2, 5), 0.5)
             taken.append(each.step_and_maybe_reset(here))
         (step, first), (step_of_copy, second) = taken
-        for key in ("pixels", ("next", "pixels"), ("next", "done")):
+        for key in ("depth", ("next", "depth"), ("next", "done")):
             assert torch.equal(step[key], step_of_copy[key])
-        assert torch.equal(first["pixels"], second["pixels"])
+        assert torch.equal(first["depth"], second["depth"])
     env.close()
     other.close()
 
@@ -342,7 +342,7 @@ def test_worker_processes_are_not_copied(name, make_fakes):
 
 def test_parts_of_an_environment_cannot_be_copied():
     env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
-    pixels = env.reset()["pixels"]
+    depth = env.reset()["depth"]
     state = copy.deepcopy(env.get_state())  # a state never changes: the same one
     for part in (env.scene, env.scene.world, env.scene.robot, env.scene.task.objects[0]):
         for make_copy in (copy.deepcopy, pickle.dumps):
@@ -351,5 +351,5 @@ def test_parts_of_an_environment_cannot_be_copied():
     with pytest.raises(TypeError, match="of one process"):
         pickle.dumps(state)
     env.step(env.reset().set("action", torch.zeros(5)))
-    assert torch.equal(env.set_state(state)["pixels"], pixels)
+    assert torch.equal(env.set_state(state)["depth"], depth)
     env.close()

@@ -7,9 +7,10 @@ import contextlib
 
 import pytest
 import torch
-from torchrl.envs import TransformedEnv
+from torchrl.envs import GymEnv, TransformedEnv
 from torchrl.envs import transforms as tr
 from torchrl.envs.utils import check_env_specs
+from torchrl.record import PixelRenderTransform
 
 import ba_torchrl
 from ba_torchrl.envs import keys
@@ -17,25 +18,27 @@ from ba_torchrl.envs import keys
 TASKS = {"close_loop/block_reaching": {}, "open_loop/block_stacking": {"num_objects": 2}}
 
 OF_IMAGES = {
-    "CatFrames": lambda: tr.CatFrames(3, dim=-3, in_keys=["pixels"]),
-    "ClipTransform": lambda: tr.ClipTransform(in_keys=["pixels"], low=0.0, high=0.1),
-    "DTypeCastTransform": lambda: tr.DTypeCastTransform(
-        torch.float32, torch.float64, in_keys=["pixels", "reward"]
+    "CatFrames": lambda key: tr.CatFrames(3, dim=-3, in_keys=[key]),
+    "ClipTransform": lambda key: tr.ClipTransform(in_keys=[key], low=0.0, high=0.1),
+    "DTypeCastTransform": lambda key: tr.DTypeCastTransform(
+        torch.float32, torch.float64, in_keys=[key, "reward"]
     ),
-    "FlattenObservation": lambda: tr.FlattenObservation(-3, -1, in_keys=["pixels"]),
-    "GrayScale": lambda: tr.Compose(
+    "FlattenObservation": lambda key: tr.FlattenObservation(-3, -1, in_keys=[key]),
+    "GrayScale": lambda key: tr.Compose(
         tr.ToTensorImage(in_keys=["rgb"], shape_tolerant=True), tr.GrayScale(in_keys=["rgb"])
     ),
-    "Hash": lambda: tr.Hash(in_keys=["pixels"], out_keys=["hash"]),
-    "ObservationNorm": lambda: tr.ObservationNorm(0.1, 2.0, in_keys=["pixels"]),
-    "PermuteTransform": lambda: tr.PermuteTransform((-1, -2, -3), in_keys=["pixels"]),
-    "SignTransform": lambda: tr.SignTransform(in_keys=["pixels"]),
-    "SqueezeTransform": lambda: tr.SqueezeTransform(-3, in_keys=["pixels"], in_keys_inv=[]),
-    "TimeMaxPool": lambda: tr.TimeMaxPool(in_keys=["pixels"], T=2),
-    "ToTensorImage": lambda: tr.ToTensorImage(in_keys=["rgb"], shape_tolerant=True),
-    "UnaryTransform": lambda: tr.UnaryTransform(["pixels"], ["doubled"], fn=lambda x: 2 * x),
-    "UnsqueezeTransform": lambda: tr.UnsqueezeTransform(-1, in_keys=["pixels"], in_keys_inv=[]),
-    "VecNormV2": lambda: tr.VecNormV2(in_keys=["pixels"]),
+    "Hash": lambda key: tr.Hash(in_keys=[key], out_keys=["hash"]),
+    "ObservationNorm": lambda key: tr.ObservationNorm(0.1, 2.0, in_keys=[key]),
+    "PermuteTransform": lambda key: tr.PermuteTransform((-1, -2, -3), in_keys=[key]),
+    "RenameTransform": lambda key: tr.RenameTransform([key], ["image"]),
+    "SelectTransform": lambda key: tr.SelectTransform(key),
+    "SignTransform": lambda key: tr.SignTransform(in_keys=[key]),
+    "SqueezeTransform": lambda key: tr.SqueezeTransform(-3, in_keys=[key], in_keys_inv=[]),
+    "TimeMaxPool": lambda key: tr.TimeMaxPool(in_keys=[key], T=2),
+    "ToTensorImage": lambda key: tr.ToTensorImage(in_keys=["rgb"], shape_tolerant=True),
+    "UnaryTransform": lambda key: tr.UnaryTransform([key], ["doubled"], fn=lambda x: 2 * x),
+    "UnsqueezeTransform": lambda key: tr.UnsqueezeTransform(-1, in_keys=[key], in_keys_inv=[]),
+    "VecNormV2": lambda key: tr.VecNormV2(in_keys=[key]),
 }
 OF_VECTORS = {
     "CatFrames": lambda: tr.CatFrames(3, dim=-1, in_keys=["observation"]),
@@ -73,8 +76,6 @@ OF_COUNTS_AND_ACTIONS = {
     "MultiAction": lambda: tr.MultiAction(),
     "NoopResetEnv": lambda: tr.NoopResetEnv(2),
     "RandomTruncationTransform": lambda: tr.RandomTruncationTransform(1, 3),
-    "RenameTransform": lambda: tr.RenameTransform(["pixels"], ["image"]),
-    "SelectTransform": lambda: tr.SelectTransform("pixels"),
     "StepCounter": lambda: tr.StepCounter(max_steps=2),
     "StepCounter, other key": lambda: tr.StepCounter(max_steps=2, step_count_key="count"),
     "TerminateTransform": lambda: tr.TerminateTransform(lambda data: data["fault"]),
@@ -110,7 +111,28 @@ def check(env, transform):
 
 @pytest.mark.parametrize("name", OF_IMAGES)
 def test_images_can_be_transformed(pixel_env, name):
-    check(pixel_env, OF_IMAGES[name]())
+    check(pixel_env, OF_IMAGES[name](next(iter(pixel_env.images))))
+
+
+def test_rendered_pixels_leave_the_image_of_the_control_alone(pixel_env):
+    key = next(iter(pixel_env.images))
+    expected = pixel_env.reset(seed=1)[key]
+    state = TransformedEnv(pixel_env, PixelRenderTransform()).reset(seed=1)
+    assert torch.equal(state[key], expected)
+    assert (state["pixels"].shape, state["pixels"].dtype) == ((360, 480, 3), torch.uint8)
+
+
+def test_pixels_of_gymnasium_are_beside_the_depth_and_become_a_tensor_image():
+    name = "BulletArm/CloseLoopBlockReaching-v0"
+    env = GymEnv(name, from_pixels=True, pixels_only=False, obs_size=16)
+    env = TransformedEnv(env, tr.ToTensorImage(["pixels"]))
+    seen = env.base_env.reset()
+    assert (seen["pixels"].shape, seen["pixels"].dtype) == ((360, 480, 3), torch.uint8)
+    state = env.rollout(1)["next"][0]
+    assert state["depth"].shape == (1, 16, 16)
+    assert (state["pixels"].shape, state["pixels"].dtype) == ((3, 360, 480), torch.float32)
+    assert 0.5 < state["pixels"].max() <= 1
+    env.close()
 
 
 @pytest.mark.parametrize("name", OF_VECTORS)

@@ -57,11 +57,11 @@ def pose(name, size=64, in_hand_size=24, half=True, **fields):
 def batch(size=32, in_hand_size=24, channels=1, n=4, seed=0):
     """Images, half of them with something held, and the choices of every level."""
     generator = torch.Generator().manual_seed(seed)
-    pixels = torch.rand(n, 1, size, size, generator=generator)
+    heightmap = torch.rand(n, 1, size, size, generator=generator)
     in_hand = torch.rand(n, channels, in_hand_size, in_hand_size, generator=generator)
     limits = (size, size, 4, 4, 3, 3)
     chosen = torch.stack([torch.randint(k, (n,), generator=generator) for k in limits], dim=1)
-    return pixels, in_hand, torch.arange(n)[:, None] % 2 == 1, chosen
+    return heightmap, in_hand, torch.arange(n)[:, None] % 2 == 1, chosen
 
 
 def pose_batch(size=64, in_hand_size=24, n=4, seed=0):
@@ -71,13 +71,13 @@ def pose_batch(size=64, in_hand_size=24, n=4, seed=0):
     in_hand = torch.randint(24, (n, 3, in_hand_size, in_hand_size), generator=generator).float()
     limits = (size, size, *COUNTS.values())
     chosen = torch.stack([torch.randint(k, (n,), generator=generator) for k in limits], dim=1)
-    pixels = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
-    return pixels, in_hand, torch.arange(n)[:, None] % 2 == 1, chosen
+    heightmap = coarse.repeat_interleave(4, -1).repeat_interleave(4, -2)
+    return heightmap, in_hand, torch.arange(n)[:, None] % 2 == 1, chosen
 
 
-def values_of(network, pixels, in_hand, holding, chosen):
+def values_of(network, heightmap, in_hand, holding, chosen):
     """The Q values of all levels."""
-    first, state = network.first(pixels, in_hand, holding)
+    first, state = network.first(heightmap, in_hand, holding)
     later = range(1, len(network.levels))
     return [first, *(network.later(n, state, chosen[:, : n + 1]) for n in later)]
 

@@ -55,22 +55,22 @@ def test_the_values_of_an_equivariant_ensemble_are_invariant():
     networks = actor_critic("equi", critics=4)
     perturb(networks.critic.first_norm)
     perturb(networks.critic.second_norm)
-    pixels, holding = torch.rand(2, 1, 64, 64), torch.tensor([[True], [False]])
+    depth, holding = torch.rand(2, 1, 64, 64), torch.tensor([[True], [False]])
     action = torch.rand(2, 5) * 2 - 1
     turned = action.clone()
     turned[:, 1], turned[:, 2] = -action[:, 2], action[:, 1]
-    values = networks.critic(networks.encoder(pixels, holding), action)
-    rotated = networks.encoder(torch.rot90(pixels, 1, (-2, -1)), holding)
+    values = networks.critic(networks.encoder(depth, holding), action)
+    rotated = networks.encoder(torch.rot90(depth, 1, (-2, -1)), holding)
     torch.testing.assert_close(networks.critic(rotated, turned), values, atol=1e-4, rtol=1e-4)
     assert not torch.allclose(networks.critic(rotated, action), values, atol=1e-3)
 
 
-OBSERVATION = ["pixels", "holding"]
+OBSERVATION = ["depth", "holding"]
 
 
 def transitions(n=4):
     def state():
-        return {"pixels": torch.rand(n, 1, 64, 64), "holding": torch.rand(n, 1) > 0.5}
+        return {"depth": torch.rand(n, 1, 64, 64), "holding": torch.rand(n, 1) > 0.5}
 
     ends = {name: torch.arange(n)[:, None] == 1 for name in ("done", "terminated")}
     action = 1.8 * torch.rand(n, 5) - 0.9

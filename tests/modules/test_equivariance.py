@@ -36,11 +36,11 @@ def steps(networks, size, action_size, n=3):
     optimizer = torch.optim.Adam(parameters, 1e-2)
     before = [p.detach().clone() for p in parameters]
     for _ in range(n):
-        pixels = torch.rand(2, 1, size, size, generator=generator)
+        depth = torch.rand(2, 1, size, size, generator=generator)
         holding = torch.rand(2, 1, generator=generator) > 0.5
         action = torch.rand(2, action_size, generator=generator) * 2 - 1
-        loc, scale = networks.actor(pixels, holding)
-        values = networks.critic(networks.encoder(pixels, holding), action)
+        loc, scale = networks.actor(depth, holding)
+        values = networks.critic(networks.encoder(depth, holding), action)
         target = torch.rand(2, action_size, generator=generator)
         loss = (loc - target).square().sum() + (scale - 1).square().sum() + (values - 1).sum()
         optimizer.zero_grad()
@@ -77,16 +77,16 @@ def test_quarter_turns_and_reflections_are_exact(size, sequence, group_order, op
     )
     if trained:
         steps(networks, size, len(sequence))
-    pixels, holding = torch.rand(2, 1, size, size), torch.tensor([[True], [False]])
+    depth, holding = torch.rand(2, 1, size, size), torch.tensor([[True], [False]])
     action = torch.rand(2, len(sequence)) * 2 - 1
     with torch.no_grad():
-        loc, scale = networks.actor(pixels, holding)
-        values = networks.critic(networks.encoder(pixels, holding), action)
+        loc, scale = networks.actor(depth, holding)
+        values = networks.critic(networks.encoder(depth, holding), action)
         planar = loc[:, [sequence.index("x"), sequence.index("y")]]
         assert planar.abs().max() > 2e-3 * loc.abs().max()  # a hundred times the tolerance below
         turns = range(0, 4, 1 if group_order > 2 else 2)
         for quarters, flips in product(turns, (False, True)[: 1 + ("reflections" in options)]):
-            image = pixels.flip(-1) if flips else pixels
+            image = depth.flip(-1) if flips else depth
             image = torch.rot90(image, quarters, (-2, -1))
             moved_loc, moved_scale = networks.actor(image, holding)
             tolerance = {"atol": 2e-5 * float(loc.abs().max()), "rtol": 1e-4}
@@ -100,10 +100,10 @@ def test_quarter_turns_and_reflections_are_exact(size, sequence, group_order, op
 
 def test_the_cyclic_group_is_not_equivariant_to_reflections():
     networks = actor_critic("equi")
-    pixels, holding = torch.rand(3, 1, 64, 64), torch.ones(3, 1, dtype=torch.bool)
+    depth, holding = torch.rand(3, 1, 64, 64), torch.ones(3, 1, dtype=torch.bool)
     with torch.no_grad():
-        loc, _ = networks.actor(pixels, holding)
-        reflected, _ = networks.actor(pixels.flip(-1), holding)
+        loc, _ = networks.actor(depth, holding)
+        reflected, _ = networks.actor(depth.flip(-1), holding)
     assert not torch.allclose(reflected, reflect_action(loc, "pxyzr"), rtol=1e-2)
 
 
@@ -114,12 +114,12 @@ def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(trained):
     if trained:
         with torch.enable_grad():
             steps(networks, 64, 5)
-    pixels, holding = torch.rand(4, 1, 64, 64), torch.tensor([[True], [False]] * 2)
+    depth, holding = torch.rand(4, 1, 64, 64), torch.tensor([[True], [False]] * 2)
     action = torch.rand(4, 5) * 2 - 1
-    loc, _ = networks.actor(pixels, holding)
-    values = networks.critic(networks.encoder(pixels, holding), action)
+    loc, _ = networks.actor(depth, holding)
+    values = networks.critic(networks.encoder(depth, holding), action)
     for quarters in range(1, 4):
-        turned = torch.rot90(pixels, quarters, (-2, -1))
+        turned = torch.rot90(depth, quarters, (-2, -1))
         expected = turn_action(loc, "pxyzr", quarters)
         assert (networks.actor(turned, holding)[0] - expected).norm() < 0.005 * loc.norm()
         features = networks.encoder(turned, holding)
@@ -169,8 +169,8 @@ def test_eighth_turns_of_a_smooth_image_are_approximately_equivariant():
 def test_the_vector_field_has_the_indices_of_x_and_y(sequence):
     """In a scene with quarter-turn symmetry, the mean displacement is zero."""
     networks = actor_critic("equi", sequence=sequence)
-    pixels = torch.full((1, 64, 64), 0.2)
-    loc, _ = networks.actor(pixels, torch.ones(1, dtype=torch.bool))
+    depth = torch.full((1, 64, 64), 0.2)
+    loc, _ = networks.actor(depth, torch.ones(1, dtype=torch.bool))
     assert loc[[1, 2]].abs().max() < 1e-5
     others = [i for i, letter in enumerate(sequence) if letter not in "xy"]
     assert loc[others].abs().min() > 1e-4
@@ -225,7 +225,7 @@ def test_the_grippers_pose_moves_with_the_scene(group_order, reflections, critic
         center_m=CENTER_M,
     )
     generator = torch.Generator().manual_seed(3)
-    pixels = torch.rand(3, 1, 64, 64, generator=generator)
+    depth = torch.rand(3, 1, 64, 64, generator=generator)
     holding = torch.tensor([[True], [False], [True]])
     action = torch.rand(3, 5, generator=generator) * 2 - 1
     yaw = (torch.rand(3, generator=generator) * 2 - 1) * math.pi
@@ -234,16 +234,16 @@ def test_the_grippers_pose_moves_with_the_scene(group_order, reflections, critic
     with torch.no_grad():
         for parameter in (each for network in networks for each in network.parameters()):
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=generator))
-        loc, scale = networks.actor(pixels, holding, proprio)
-        values = networks.critic(networks.encoder(pixels, holding, proprio), action)
+        loc, scale = networks.actor(depth, holding, proprio)
+        values = networks.critic(networks.encoder(depth, holding, proprio), action)
         for entry in (0, 1, 2, 3, 4, 7):  # all but those that are zero
             other = proprio.clone()
             other[:, entry] += 0.1
-            changed = torch.cat(networks.actor(pixels, holding, other), dim=1)
+            changed = torch.cat(networks.actor(depth, holding, other), dim=1)
             assert (changed - torch.cat([loc, scale], dim=1)).abs().max() > 1e-3
         turns = range(4) if group_order > 2 else (0, 2)
         for quarters, flips in product(turns, [False, True] if reflections else [False]):
-            moved = pixels.flip(-1) if flips else pixels
+            moved = depth.flip(-1) if flips else depth
             moved = torch.rot90(moved, quarters, (-2, -1)), holding
             pose = move_proprio(proprio, quarters, flips)
 
@@ -259,5 +259,5 @@ def test_the_grippers_pose_moves_with_the_scene(group_order, reflections, critic
 
 
 def test_a_vector_with_unknown_rotation_is_refused():
-    with pytest.raises(ConfigError, match="joint_positions rotates"):
-        actor_critic("equi", vectors={"proprio": 8, "joint_positions": 7})
+    with pytest.raises(ConfigError, match="joints rotates"):
+        actor_critic("equi", vectors={"proprio": 8, "joints": 7})

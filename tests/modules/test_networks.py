@@ -40,28 +40,28 @@ def test_parameter_counts_match_the_paper(name, fields, actor, critic):
 def test_any_batch_shape(name, sequence, leading):
     networks = small(name, sequence=sequence)
     size = len(sequence)
-    pixels = torch.rand(*leading, 1, 64, 64)
+    depth = torch.rand(*leading, 1, 64, 64)
     holding = torch.rand(*leading, 1) > 0.5
     action = torch.rand(*leading, size) * 2 - 1
-    loc, scale = networks.actor(pixels, holding)
+    loc, scale = networks.actor(depth, holding)
     assert loc.shape == scale.shape == (*leading, size)
     assert (scale > 0).all()
-    features = networks.encoder(pixels, holding)
+    features = networks.encoder(depth, holding)
     assert features.shape[:-1] == leading
     values = networks.critic(features, action)
     assert values.shape == (*leading, 2)
     if len(leading) == 2:  # elements do not mix
-        one = networks.critic(networks.encoder(pixels[1, 2], holding[1, 2]), action[1, 2])
+        one = networks.critic(networks.encoder(depth[1, 2], holding[1, 2]), action[1, 2])
         torch.testing.assert_close(one, values[1, 2], atol=1e-5, rtol=1e-4)
 
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
 def test_outputs_depend_on_holding_and_action(name):
     networks = small(name)
-    pixels = torch.rand(1, 64, 64)
+    depth = torch.rand(1, 64, 64)
     held, free = torch.tensor([True]), torch.tensor([False])
-    assert not torch.allclose(networks.actor(pixels, held)[0], networks.actor(pixels, free)[0])
-    features = networks.encoder(pixels, held)
+    assert not torch.allclose(networks.actor(depth, held)[0], networks.actor(depth, free)[0])
+    features = networks.encoder(depth, held)
     for component in range(5):
         action = torch.zeros(5)
         action[component] = 1
@@ -74,12 +74,12 @@ def test_outputs_depend_on_holding_and_action(name):
 def test_copies_and_pickles_are_small_and_equal(name):
     """Policies are copied for evaluation and sent to processes that may lack escnn."""
     networks = small(name)
-    pixels, holding = torch.rand(1, 64, 64), torch.tensor([True])
+    depth, holding = torch.rand(1, 64, 64), torch.tensor([True])
     data = pickle.dumps(networks.actor)
     assert b"escnn" not in data
     assert len(data) < 4 * count(networks.actor) + 3e5
     for other in (copy.deepcopy(networks.actor), pickle.loads(data)):
-        assert torch.equal(other(pixels, holding)[0], networks.actor(pixels, holding)[0])
+        assert torch.equal(other(depth, holding)[0], networks.actor(depth, holding)[0])
 
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)
@@ -101,10 +101,10 @@ def test_bfloat16_is_close_to_float32(name):
     rough = small(name, precision="bfloat16")
     for one, other in zip(rough, exact, strict=True):
         one.load_state_dict(other.state_dict())
-    pixels, holding = torch.rand(8, 1, 64, 64), torch.rand(8, 1) > 0.5
-    loc, scale = rough.actor(pixels, holding)
+    depth, holding = torch.rand(8, 1, 64, 64), torch.rand(8, 1) > 0.5
+    loc, scale = rough.actor(depth, holding)
     assert loc.dtype == scale.dtype == torch.float32
-    expected = exact.actor(pixels, holding)[0]
+    expected = exact.actor(depth, holding)[0]
     assert (loc - expected).norm() < 0.05 * expected.norm()
     loc.sum().backward()
     assert {p.grad.dtype for p in rough.actor.parameters() if p.grad is not None} == {torch.float32}

@@ -20,10 +20,10 @@ def build(name="equi_deictic_asr", half=False, trained=False, **fields):
 
 def turned(observation, chosen, quarters, yaw_steps):
     """The scene after quarter turns by torch.rot90, and the choices that rotate with it."""
-    pixels, in_hand, holding = observation
+    heightmap, in_hand, holding = observation
     moved = torch.cat([turned_pixels(chosen, SIZE, quarters), chosen[:, 2:]], dim=1)
     moved[:, 2] = (chosen[:, 2] + yaw_steps) % 8
-    return (torch.rot90(pixels, quarters, (-2, -1)), in_hand, holding, moved)
+    return (torch.rot90(heightmap, quarters, (-2, -1)), in_hand, holding, moved)
 
 
 def spread(values):
@@ -79,7 +79,7 @@ def test_values_of_a_flattened_scene_are_invariant_for_fixed_features_only(train
 
 def wrapped(observation, chosen):
     """The same poses with the fingers swapped where the yaw has left half a turn."""
-    pixels, in_hand, holding = observation
+    heightmap, in_hand, holding = observation
     is_swapped = chosen[:, 2] >= 8
     # half a turn of the gripper: rows and columns of the axes y z, x z and x y
     reversed_hand = torch.stack(
@@ -88,7 +88,7 @@ def wrapped(observation, chosen):
     in_hand = torch.where(is_swapped[:, None, None, None], reversed_hand, in_hand)
     tilts = torch.where(is_swapped[:, None], 2 - chosen[:, 4:], chosen[:, 4:])
     chosen = torch.cat([chosen[:, :2], chosen[:, 2:3] % 8, chosen[:, 3:4], tilts], dim=1)
-    return (pixels, in_hand, holding), chosen, is_swapped
+    return (heightmap, in_hand, holding), chosen, is_swapped
 
 
 @pytest.mark.parametrize("trained", [False, True])
@@ -133,9 +133,9 @@ def test_tilts_and_what_is_held_turn_over_with_the_fingers():
     chosen[:, 4] = 0
     tilted = chosen.clone()
     tilted[:, 4] = 2
-    pixels, in_hand, holding = observation
+    heightmap, in_hand, holding = observation
     with torch.no_grad():
         expected = values_of(network, *observation, chosen)[4]
         assert_different(values_of(network, *observation, tilted)[4], expected)
-        other = (pixels, in_hand.flip(-2), holding)
+        other = (heightmap, in_hand.flip(-2), holding)
         assert_different(values_of(network, *other, chosen)[4], expected)

@@ -120,30 +120,30 @@ def swapped(pose):
 def test_every_candidate_pose_sees_the_scene_from_itself(half):
     """With yaws of half a turn, first with one order of the fingers, then with the other."""
     views = build("equi_deictic_asr", half=half).views
-    pixels, *_, chosen = batch()
+    heightmap, *_, chosen = batch()
     for number, name in ((1, "z"), (2, "ry"), (3, "rx")):
-        found = views[number](pixels, chosen[:, : number + 2])
+        found = views[number](heightmap, chosen[:, : number + 2])
         for i in range(4):
             pose = pose_of(chosen[i], half) | dict.fromkeys(("ry", "rx")[number - 1 :], 0.0)
             poses = [pose | {name: grid(name, index, half)} for index in range(COUNTS[name])]
             poses += [swapped(pose) for pose in poses] if half else []
-            heights = pixels[i, 0].numpy()
+            heights = heightmap[i, 0].numpy()
             expected = [projection(heights, chosen[i], half, **pose) for pose in poses]
             assert_close(found[i], np.stack(expected))
 
 
 def test_the_plain_levels_see_patches_and_projections_at_the_chosen_pose():
     views = build("asr").views
-    pixels, *_, chosen = batch()
+    heightmap, *_, chosen = batch()
     for i in range(4):
-        heights = pixels[i, 0].numpy()
+        heights = heightmap[i, 0].numpy()
         center = tuple(chosen[i, :2].numpy() + 0.5)
         for number, yaw in ((0, 0.0), (1, grid("rz", int(chosen[i, 2]), True))):
-            found = views[number](pixels, chosen[:, : number + 2])
+            found = views[number](heightmap, chosen[:, : number + 2])
             expected = crop(heights, center, 24, yaw)
             np.testing.assert_allclose(found[i, 0, 0], expected, atol=1e-5)
         for number, tilts in ((2, {"ry": 0.0, "rx": 0.0}), (3, {"rx": 0.0})):
-            found = views[number](pixels, chosen[:, : number + 2])
+            found = views[number](heightmap, chosen[:, : number + 2])
             assert_close(found[i], projection(heights, chosen[i], True, **tilts)[None])
 
 

@@ -40,9 +40,9 @@ def under_a_quarter_turn(network, shift):
 
     A quarter turn shifts the yaws by ``shift``.
     """
-    pixels, in_hand, holding, chosen = batch()
-    first, state = network.first(pixels, in_hand, holding)
-    turned, turned_state = network.first(torch.rot90(pixels, 1, (-2, -1)), in_hand, holding)
+    heightmap, in_hand, holding, chosen = batch()
+    first, state = network.first(heightmap, in_hand, holding)
+    turned, turned_state = network.first(torch.rot90(heightmap, 1, (-2, -1)), in_hand, holding)
     expected = torch.rot90(first, 1, (-2, -1))
     if network.levels[0].components[0] == "rz":
         expected = expected.roll(shift, dims=1)
@@ -74,11 +74,11 @@ def test_a_quarter_turn_turns_pixels_and_shifts_yaws(name, components, half, fie
 @pytest.mark.parametrize("trained", [False, True])
 def test_yaws_of_a_flattened_scene_are_equivariant_for_fixed_features_only(trained):
     network = build("equi_asr", num_rotations=6, scene_head="flatten", trained=trained)
-    pixels, in_hand, holding, chosen = batch()
+    heightmap, in_hand, holding, chosen = batch()
     with torch.no_grad():
-        state = network.first(pixels, in_hand, holding)[1]
+        state = network.first(heightmap, in_hand, holding)[1]
         expected = network.later(1, state, chosen).roll(3, dims=1)
-        turned = network.first(torch.rot90(pixels, 1, (-2, -1)), in_hand, holding)[1]
+        turned = network.first(torch.rot90(heightmap, 1, (-2, -1)), in_hand, holding)[1]
         moved = turned_pixels(chosen, SIZE)
         assert_equal(network.later(1, turned._replace(scene=state.scene), moved), expected)
         difference = network.later(1, turned, moved) - expected
@@ -103,11 +103,11 @@ def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(
 @pytest.mark.parametrize("name", ["equi_fcn", "equi_asr"])
 def test_flips_of_the_image_flip_the_pixels_values(name, trained):
     network = build(name, XY if name == "equi_fcn" else XYR, trained=trained)
-    pixels, in_hand, holding, _ = batch()
+    heightmap, in_hand, holding, _ = batch()
     with torch.no_grad():
-        values = network.first(pixels, in_hand, holding)[0]
+        values = network.first(heightmap, in_hand, holding)[0]
         for dim in (-2, -1):
-            flipped = network.first(pixels.flip(dim), in_hand, holding)[0]
+            flipped = network.first(heightmap.flip(dim), in_hand, holding)[0]
             assert_equal(flipped, values.flip(dim))
 
 
@@ -115,12 +115,12 @@ def test_flips_of_the_image_flip_the_pixels_values(name, trained):
 def test_rot_fcn_sees_each_yaw_in_its_own_frame(half, num_rotations):
     """Rotating the scene shifts the yaws; beyond half a turn, views are rotated by 180 degrees."""
     network = build("rot_fcn", half=half, size=26, num_rotations=num_rotations)
-    pixels, in_hand, holding, _ = batch(size=26)
+    heightmap, in_hand, holding, _ = batch(size=26)
     with torch.no_grad():
         for parameter in network.parameters():
             parameter.add_(0.01 * torch.randn_like(parameter))  # biases, too
-        values = network.first(pixels, in_hand, holding)[0]
-        turned = network.first(torch.rot90(pixels, 1, (-2, -1)), in_hand, holding)[0]
+        values = network.first(heightmap, in_hand, holding)[0]
+        turned = network.first(torch.rot90(heightmap, 1, (-2, -1)), in_hand, holding)[0]
     expected = torch.rot90(values, 1, (-2, -1)).roll(num_rotations // (2 if half else 4), dims=1)
     assert_equal(turned[:, num_rotations // 2 :], expected[:, num_rotations // 2 :])
     if not half:
@@ -130,11 +130,11 @@ def test_rot_fcn_sees_each_yaw_in_its_own_frame(half, num_rotations):
 def test_rot_fcn_rotates_the_image_against_the_yaw():
     """A gripper at +90 degrees sees the scene rotated by -90; its values are rotated back."""
     network = build("rot_fcn", half=False, size=26, num_rotations=4)
-    pixels, in_hand, holding, _ = batch(size=26)
+    heightmap, in_hand, holding, _ = batch(size=26)
     assert network.padded_size == 48
-    padded = torch.nn.functional.pad(pixels, (11,) * 4)
+    padded = torch.nn.functional.pad(heightmap, (11,) * 4)
     with torch.no_grad():
-        values = network.first(pixels, in_hand, holding)[0]
+        values = network.first(heightmap, in_hand, holding)[0]
         for index in range(4):
             view = torch.rot90(padded, -index, (-2, -1))
             expected = network.values(view, in_hand, holding)[0][:, 0]
@@ -161,12 +161,12 @@ def test_a_shift_by_the_stride_shifts_the_values(name, components, fields):
         for parameter_name, parameter in network.named_parameters():
             if parameter_name.endswith("bias") and "coefficients" not in parameter_name:
                 parameter.zero_()  # the dynamic filter's coefficients stay
-    pixels = torch.zeros(1, 1, size, size)
-    pixels[..., 136:148, 140:150] = torch.rand(12, 10)
-    moved = pixels.roll((16, -16), dims=(-2, -1))
+    heightmap = torch.zeros(1, 1, size, size)
+    heightmap[..., 136:148, 140:150] = torch.rand(12, 10)
+    moved = heightmap.roll((16, -16), dims=(-2, -1))
     in_hand, holding = torch.zeros(1, 1, 24, 24), torch.tensor([[name.startswith("equi")]])
     with torch.no_grad():
-        values, state = network.first(pixels, in_hand, holding)
+        values, state = network.first(heightmap, in_hand, holding)
         shifted, shifted_state = network.first(moved, in_hand, holding)
         assert_equal(shifted, values.roll((16, -16), dims=(-2, -1)))
         if name == "equi_asr":  # the plain one's yaws depend on where in the image they are
@@ -174,5 +174,5 @@ def test_a_shift_by_the_stride_shifts_the_values(name, components, fields):
             yaws = network.later(1, state, chosen)
             shifted_yaws = network.later(1, shifted_state, chosen + torch.tensor([16, -16]))
             assert_equal(shifted_yaws, yaws)
-        half_stride = network.first(pixels.roll(3, dims=-1), in_hand, holding)[0]
+        half_stride = network.first(heightmap.roll(3, dims=-1), in_hand, holding)[0]
     assert (half_stride - values.roll(3, dims=-1)).abs().max() > 1e-3 * values.abs().max()

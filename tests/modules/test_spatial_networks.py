@@ -136,20 +136,20 @@ def test_rot_fcn_supports_ninety_pixels_as_in_the_paper():
 @pytest.mark.parametrize("name", EVERY)
 def test_values_depend_on_every_input_and_on_their_own_sample_only(name, channels):
     network = build(name, channels=channels)
-    pixels, in_hand, holding, chosen = batch(channels=channels)
+    heightmap, in_hand, holding, chosen = batch(channels=channels)
     with torch.no_grad():
-        values = values_of(network, pixels, in_hand, holding, chosen)
-        other = values_of(network, pixels, in_hand, ~holding, chosen)
+        values = values_of(network, heightmap, in_hand, holding, chosen)
+        other = values_of(network, heightmap, in_hand, ~holding, chosen)
         for q, p in zip(values, other, strict=True):
             assert ((q - p).abs().flatten(1).amax(dim=1) > 1e-4 * q.std()).all()  # the primitive
-        other = values_of(network, pixels, in_hand.flip(-1) * 2, holding, chosen)
+        other = values_of(network, heightmap, in_hand.flip(-1) * 2, holding, chosen)
         for q, p in zip(values, other, strict=True):
             assert (q - p)[1].abs().max() > 1e-4 * q.std()  # what is held
-        other = values_of(network, pixels.flip(0), in_hand, holding, chosen)
+        other = values_of(network, heightmap.flip(0), in_hand, holding, chosen)
         for q, p in zip(values, other, strict=True):
             assert (q - p).abs().max() > 1e-3 * q.std()
         for i in range(4):
-            inputs = (each[i : i + 1] for each in (pixels, in_hand, holding, chosen))
+            inputs = (each[i : i + 1] for each in (heightmap, in_hand, holding, chosen))
             alone = values_of(network, *inputs)
             for q, p in zip(values, alone, strict=True):
                 torch.testing.assert_close(p[0], q[i], atol=1e-5, rtol=1e-4)
@@ -158,10 +158,10 @@ def test_values_depend_on_every_input_and_on_their_own_sample_only(name, channel
 @pytest.mark.parametrize("name", ["equi_fcn", "equi_asr"])
 def test_pick_values_do_not_depend_on_the_in_hand_image(name):
     network = build(name)
-    pixels, in_hand, holding, _ = batch()
+    heightmap, in_hand, holding, _ = batch()
     with torch.no_grad():
-        values = network.first(pixels, in_hand, holding)[0]
-        other = network.first(pixels, in_hand.flip(0) * 3, holding)[0]
+        values = network.first(heightmap, in_hand, holding)[0]
+        other = network.first(heightmap, in_hand.flip(0) * 3, holding)[0]
     opened = ~holding[:, 0]
     assert torch.equal(values[opened], other[opened])
     assert not torch.allclose(values[~opened], other[~opened])
@@ -171,9 +171,10 @@ def test_pick_values_do_not_depend_on_the_in_hand_image(name):
 @pytest.mark.parametrize("name", EVERY)
 def test_a_batch_with_a_single_primitive_has_gradients(name, primitive):
     network = build(name)
-    pixels, in_hand, _, chosen = batch()
+    heightmap, in_hand, _, chosen = batch()
     holding = torch.full((4, 1), primitive)
-    sum(q.square().sum() for q in values_of(network, pixels, in_hand, holding, chosen)).backward()
+    values = values_of(network, heightmap, in_hand, holding, chosen)
+    sum(q.square().sum() for q in values).backward()
     assert all(p.grad is None or torch.isfinite(p.grad).all() for p in network.parameters())
     some = [p for p in network.parameters() if p.grad is not None and p.grad.abs().sum() > 0]
     assert len(some) > 10
@@ -183,12 +184,12 @@ def test_a_batch_with_a_single_primitive_has_gradients(name, primitive):
 @torch.no_grad()
 def test_initial_values_of_narrow_networks_differ(seed):
     """Otherwise many pixels share the maximum, or the last layer of yaws has no gradient."""
-    pixels, in_hand, _, _ = inputs = batch()
+    heightmap, in_hand, _, _ = inputs = batch()
     torch.manual_seed(seed)
     network = NETWORKS["equi_fcn"](width=0.125, precision="float32")
     network = network.build(spatial_spec(32, 24, 1, XY))
     for holding in (False, True):
-        values, _ = network.first(pixels, in_hand, torch.full((4, 1), holding))
+        values, _ = network.first(heightmap, in_hand, torch.full((4, 1), holding))
         best, second = values.flatten(1).topk(2).values.unbind(1)
         assert (best > second).all()
     torch.manual_seed(seed)
@@ -211,9 +212,9 @@ def test_the_second_level_trains_the_encoder_of_the_first(name):
 @pytest.mark.parametrize("name", ["asr", "equi_asr"])
 def test_the_second_level_depends_on_the_chosen_pixel(name):
     network = build(name)
-    pixels, in_hand, holding, chosen = batch()
+    heightmap, in_hand, holding, chosen = batch()
     with torch.no_grad():
-        state = network.first(pixels, in_hand, holding)[1]
+        state = network.first(heightmap, in_hand, holding)[1]
         here, there = network.later(1, state, chosen), network.later(1, state, (chosen + 16) % 32)
     assert ((here - there).abs().amax(dim=1) > 1e-3 * here.std()).all()
     with pytest.raises(ValueError, match="later levels of this network are 1 to 1, got 2"):
@@ -256,10 +257,10 @@ def test_values_of_bfloat16_networks_have_float32_resolution():
 @pytest.mark.parametrize("name", SPATIAL)
 def test_scaled_heights_give_the_same_values(name):
     metres, units = build(name), build(name, height_scale_m=0.05)
-    pixels, in_hand, holding, chosen = batch()
+    heightmap, in_hand, holding, chosen = batch()
     for expected, actual in zip(
-        values_of(metres, pixels, in_hand, holding, chosen),
-        values_of(units, pixels * 0.05, in_hand * 0.05, holding, chosen),
+        values_of(metres, heightmap, in_hand, holding, chosen),
+        values_of(units, heightmap * 0.05, in_hand * 0.05, holding, chosen),
         strict=True,
     ):
         torch.testing.assert_close(
@@ -330,8 +331,8 @@ def test_unsupported_images_and_actions_are_refused(name):
 def test_patches_and_in_hand_images_of_other_sizes():
     for name in ("asr", "equi_asr"):
         network = build(name, in_hand_size=32, patch_size=24)
-        pixels, in_hand, holding, chosen = batch(in_hand_size=32)
-        state = network.first(pixels, in_hand, holding)[1]
+        heightmap, in_hand, holding, chosen = batch(in_hand_size=32)
+        state = network.first(heightmap, in_hand, holding)[1]
         assert network.later(1, state, chosen).shape == (4, 4)
         with pytest.raises(ValueError, match="even number of pixels"):
             build(name, in_hand_size=25, patch_size=24)

@@ -37,9 +37,9 @@ class Table(SpatialQNetwork):
         self.pixels = nn.Parameter(torch.rand(2, 6, 8, generator=generator))
         self.yaws = nn.Parameter(torch.rand(2, 6, 8, 4, generator=generator))
 
-    def first(self, pixels, in_hand, holding):
+    def first(self, heightmap, in_hand, holding):
         primitive = holding[:, 0].long()
-        return self.pixels[primitive] + 0 * pixels.mean(), primitive
+        return self.pixels[primitive] + 0 * heightmap.mean(), primitive
 
     def later(self, level, state, chosen):
         assert level == 1
@@ -216,27 +216,27 @@ def policy(epsilon=0.0, seed=0):
 def test_the_policy_writes_only_the_action_for_any_batch_shape(shape):
     state = TensorDict(
         {
-            "pixels": torch.zeros(*shape, 1, 6, 8),
+            "heightmap": torch.zeros(*shape, 1, 6, 8),
             "in_hand": torch.zeros(*shape, 1, 4, 4),
             "holding": torch.ones(*shape, 1, dtype=torch.bool),
         },
         batch_size=shape,
     )
     out = spatial_policy(policy())(state)
-    assert set(out.keys()) == {"pixels", "in_hand", "holding", "action"}
+    assert set(out.keys()) == {"heightmap", "in_hand", "holding", "action"}
     assert out["action"].shape == (*shape, 4)
     assert (out["action"][..., 0] == 1).all()
 
 
 def test_exploration_chooses_pixels_of_objects_and_keeps_the_primitive():
-    pixels, in_hand, holding = observation(4000)
-    pixels[:, 0, 2, 3] = pixels[:, 0, 4, 5] = 0.03
+    heightmap, in_hand, holding = observation(4000)
+    heightmap[:, 0, 2, 3] = heightmap[:, 0, 4, 5] = 0.03
     holding[::2] = True
     explorer = policy(epsilon=0.75)
     with set_exploration_type(ExplorationType.RANDOM):
-        action = explorer(pixels, in_hand, holding)
+        action = explorer(heightmap, in_hand, holding)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
-        greedy = explorer(pixels, in_hand, holding)
+        greedy = explorer(heightmap, in_hand, holding)
     assert torch.equal(action[:, 0], holding[:, 0].float())
     same = (action == greedy).all(dim=1)
     assert abs(float(same.float().mean()) - 0.25) < 0.03

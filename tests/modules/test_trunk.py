@@ -18,10 +18,10 @@ def build(network, **options):
 
 def scene(size=64, *, block=(10, 10), hand_m=0.3):
     """A floor with a block 5 cm high, seen from a height."""
-    pixels = torch.full((1, 1, size, size), hand_m)
+    depth = torch.full((1, 1, size, size), hand_m)
     row, column = block
-    pixels[..., row : row + 7, column : column + 7] -= 0.05
-    return pixels
+    depth[..., row : row + 7, column : column + 7] -= 0.05
+    return depth
 
 
 @pytest.mark.parametrize("network", ["equi", "cnn", "ferm"])
@@ -30,8 +30,8 @@ def test_inputs_are_heights_above_the_floor_and_its_depth(network):
     trunk = trunk if hasattr(trunk, "convs") else trunk.trunk
     seen = []
     trunk.convs[0].register_forward_pre_hook(lambda _, inputs: seen.append(inputs[0]))
-    pixels = torch.cat([scene(), scene(hand_m=0.2)])
-    trunk(pixels, torch.tensor([[True], [False]]))
+    depth = torch.cat([scene(), scene(hand_m=0.2)])
+    trunk(depth, torch.tensor([[True], [False]]))
     (inputs,) = seen
     assert inputs.shape == (2, 3, 64, 64)
     heights, floor, holding = inputs.unbind(1)
@@ -47,13 +47,13 @@ def test_inputs_are_heights_above_the_floor_and_its_depth(network):
 @pytest.mark.parametrize("slope", [0.0, 0.2])
 def test_stages_are_convolution_pool_and_activation(network, slope):
     trunk = build(network, negative_slope=slope).encoder
-    pixels, holding = torch.rand(2, 1, 64, 64), torch.tensor([[True], [False]])
-    x = torch.cat([(pixels - 0.2) / 0.1, holding.float()[..., None, None].expand(2, 1, 64, 64)], 1)
+    depth, holding = torch.rand(2, 1, 64, 64), torch.tensor([[True], [False]])
+    x = torch.cat([(depth - 0.2) / 0.1, holding.float()[..., None, None].expand(2, 1, 64, 64)], 1)
     for conv, pools in zip(trunk.convs, trunk.pools, strict=True):
         x = conv(x)
         x = F.max_pool2d(x, 2) if pools else x
         x = torch.where(x > 0, x, slope * x)
-    torch.testing.assert_close(trunk(pixels, holding), x.flatten(1))
+    torch.testing.assert_close(trunk(depth, holding), x.flatten(1))
 
 
 def test_a_block_always_changes_the_action_if_negative_values_pass():

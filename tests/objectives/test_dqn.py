@@ -40,8 +40,8 @@ class Tables(SpatialQNetwork):
             torch.randn(2, *COUNTS[: n + 2], generator=generator) for n in range(5)
         )
 
-    def first(self, pixels, in_hand, holding):
-        state = holding[:, 0].long(), pixels.mean(dim=(1, 2, 3))
+    def first(self, heightmap, in_hand, holding):
+        state = holding[:, 0].long(), heightmap.mean(dim=(1, 2, 3))
         return self.tables[0][state[0]] * state[1][:, None, None], state
 
     def later(self, level, state, chosen):
@@ -59,7 +59,7 @@ def batch(size=10, experts="some", seed=0):
 
     def state():
         return {
-            "pixels": torch.rand(size, 1, 3, 3, generator=generator) + 0.5,
+            "heightmap": torch.rand(size, 1, 3, 3, generator=generator) + 0.5,
             "in_hand": torch.zeros(size, 1, 4, 4),
             "holding": torch.rand(size, 1, generator=generator) < 0.5,
         }
@@ -90,7 +90,7 @@ def make_loss(**settings):
 def lookup(params, level, state, index, chosen):
     """Return {choice: value} of a level, given the choices before it."""
     table = params["network", "tables", str(level)].detach().double()
-    scale = float(state["pixels"][index].double().mean())
+    scale = float(state["heightmap"][index].double().mean())
     row = table[int(state["holding"][index])]
     for choice in chosen:
         row = row[choice]
@@ -272,8 +272,8 @@ def q_value_actor(action_space="categorical"):
     """An actor of TorchRL with five actions, and a batch for it."""
     torch.manual_seed(0)
     network = nn.Sequential(nn.Flatten(), nn.Linear(9, 5))
-    actor = QValueActor(network, in_keys=["pixels"], action_space=action_space)
-    data = batch().select("pixels", "is_demonstration", "next")
+    actor = QValueActor(network, in_keys=["heightmap"], action_space=action_space)
+    data = batch().select("heightmap", "is_demonstration", "next")
     index = torch.randint(5, (10,))
     data["action"] = nn.functional.one_hot(index, 5) if action_space == "one_hot" else index
     return network, actor, data, index
@@ -316,8 +316,8 @@ def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
     loss = LevelDQNLoss(actor, demonstrations="sdqfd", margin=0.3).make_value_estimator(gamma=GAMMA)
     found = loss(data)
     with torch.no_grad():
-        q = network(data["pixels"])
-        best = network(data["next", "pixels"]).max(dim=1, keepdim=True).values
+        q = network(data["heightmap"])
+        best = network(data["next", "heightmap"]).max(dim=1, keepdim=True).values
         target = data["next", "reward"] + GAMMA * ~data["next", "terminated"] * best
         wanted = nn.functional.huber_loss(q.gather(1, index[:, None]), target)
         margin = (strict_large_margin(q, index, 0.3) * data["is_demonstration"][:, 0]).mean()

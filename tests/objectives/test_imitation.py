@@ -25,11 +25,11 @@ class Constant(nn.Module):
         self.loc = nn.Parameter(torch.tensor(loc, dtype=torch.float64))
         self.log_scale = nn.Parameter(torch.tensor(scale, dtype=torch.float64).log())
 
-    def forward(self, pixels, holding):
-        return tuple(p.expand(len(pixels), -1) for p in (self.loc, self.log_scale.exp()))
+    def forward(self, depth, holding):
+        return tuple(p.expand(len(depth), -1) for p in (self.loc, self.log_scale.exp()))
 
 
-OBSERVATION = [keys.PIXELS, keys.HOLDING]
+OBSERVATION = [keys.DEPTH, keys.HOLDING]
 
 
 @pytest.mark.parametrize("distance", ["mse", "kl"])
@@ -79,15 +79,15 @@ def test_the_entropy_term_is_that_of_the_drawn_action(loc):
 class Shifted(nn.Module):
     """An almost deterministic policy: the first two components of the image."""
 
-    def forward(self, pixels, holding):
-        return pixels[..., :2].atanh(), torch.full_like(pixels[..., :2], 1e-9)
+    def forward(self, depth, holding):
+        return depth[..., :2].atanh(), torch.full_like(depth[..., :2], 1e-9)
 
 
 def test_every_view_of_an_observation_is_compared_with_the_action():
     loss = BehaviourCloningLoss(squashed_gaussian_policy(Shifted(), OBSERVATION))
     action = torch.tensor([[0.1, 0.2], [-0.3, 0.4]])
     views = action[:, None] + torch.tensor([0.0, 0.1, -0.2])[:, None]
-    data = {keys.PIXELS: views, keys.HOLDING: torch.zeros(2, 3, 1).bool(), keys.ACTION: action}
+    data = {keys.DEPTH: views, keys.HOLDING: torch.zeros(2, 3, 1).bool(), keys.ACTION: action}
     found = loss(TensorDict(data, [2]))["loss_bc"]
     assert found.item() == pytest.approx((0.1**2 + 0.2**2) / 3, rel=1e-4)
 
@@ -95,16 +95,16 @@ def test_every_view_of_an_observation_is_compared_with_the_action():
 class TwoLevels(nn.Module):
     """Values [B, 3] and [B, 2]; the action holds the choices."""
 
-    in_keys = ("pixels",)
+    in_keys = ("depth",)
 
     def __init__(self):
         super().__init__()
         self.first = nn.Parameter(torch.tensor([0.0, math.log(2), math.log(5)]))
         self.second = nn.Parameter(torch.tensor([0.0, math.log(3)]))
 
-    def forward(self, pixels, action):
+    def forward(self, depth, action):
         chosen = action.long()
-        count = len(pixels)
+        count = len(depth)
         return [
             (self.first.expand(count, 3), chosen[:, 0]),
             (self.second.expand(count, 2), chosen[:, 1]),
@@ -114,7 +114,7 @@ class TwoLevels(nn.Module):
 def test_cross_entropies_are_averaged_over_the_batch_and_summed_over_levels():
     loss = LevelCrossEntropyLoss(TwoLevels())
     data = TensorDict(
-        {"pixels": torch.zeros(2, 1), keys.ACTION: torch.tensor([[2.0, 0.0], [1.0, 1.0]])}, [2]
+        {"depth": torch.zeros(2, 1), keys.ACTION: torch.tensor([[2.0, 0.0], [1.0, 1.0]])}, [2]
     )
     found = loss(data)
     # softmax: (1, 2, 5) / 8 and (1, 3) / 4
@@ -160,7 +160,7 @@ def test_masked_samples_do_not_count(is_level):
         data[keys.ACTION] = torch.tensor([[2.0, 0.0], [1.0, 1.0], [0.0, 1.0], [2.0, 1.0]])
     else:
         loss = BehaviourCloningLoss(squashed_gaussian_policy(Shifted(), OBSERVATION))
-        data[keys.PIXELS] /= 2
+        data[keys.DEPTH] /= 2
     mask = torch.tensor([True, False, True, False])
     expected = dict(loss(data[mask]))
     data["collector", "mask"] = mask[:, None]

@@ -69,7 +69,7 @@ def by_hand(
         return affine(*parameters(f"{prefix}qvalue_network_params"), features + action)
 
     def observation(tree, i):
-        return [*tree[keys.PIXELS][i].tolist(), float(tree[keys.HOLDING][i])]
+        return [*tree[keys.DEPTH][i].tolist(), float(tree[keys.HOLDING][i])]
 
     n = len(data)
     critic, policy_weights, others = importance(data, terms, norm)
@@ -283,8 +283,8 @@ class OneValue(nn.Module):
         self.encoder, self.critics = loss.encoder_network.module, loss.qvalue_network.module
         self.register_buffer("share", torch.eye(2, dtype=torch.float64)[number])
 
-    def forward(self, pixels, holding, action):
-        values = self.critics(self.encoder(pixels, holding), action)
+    def forward(self, depth, holding, action):
+        values = self.critics(self.encoder(depth, holding), action)
         return (self.share * values).sum(dim=-1, keepdim=True)
 
 
@@ -297,7 +297,7 @@ def test_without_demonstrations_the_loss_is_torchrls(reduction, is_masked, uses_
         data["collector", "mask"] = torch.tensor([[True], [False], [True], [True]])
     settings = {"alpha_init": 0.2, "target_entropy": -1.5}
     ours = make(demonstration_weight=0.0, weighted_terms="all", **settings, **options)
-    inputs = [keys.PIXELS, keys.HOLDING, keys.ACTION]
+    inputs = [keys.DEPTH, keys.HOLDING, keys.ACTION]
     critics = [TensorDictModule(OneValue(ours, k), inputs, ["state_action_value"]) for k in (0, 1)]
     theirs = SACLoss(ours.actor_network, critics, loss_function="l2", **settings, **options)
     SoftUpdate(theirs, tau=0.01)
@@ -428,8 +428,8 @@ def views_of(data, count, path=()):
     views = []
     for _ in range(count):
         view = data.clone()
-        noise = torch.rand(data[(*path, keys.PIXELS)].shape, generator=generator)
-        view[(*path, keys.PIXELS)] += noise.double()
+        noise = torch.rand(data[(*path, keys.DEPTH)].shape, generator=generator)
+        view[(*path, keys.DEPTH)] += noise.double()
         views.append(view)
     return views
 
@@ -438,7 +438,7 @@ def with_views(data):
     """Return a batch with views, and its parts as batches with a single one."""
     states, followings = views_of(data, VIEWS), views_of(data, TARGET_VIEWS, (keys.NEXT,))
     out = data.clone()
-    for key in (keys.PIXELS, keys.HOLDING):
+    for key in (keys.DEPTH, keys.HOLDING):
         out[key] = torch.stack([view[key] for view in states], dim=1)
         nested = (keys.NEXT, key)
         out[nested] = torch.stack([view[nested] for view in followings], dim=1)
@@ -476,7 +476,7 @@ def test_losses_and_priorities_are_means_over_the_views_of_the_observation(terms
 def test_one_view_of_either_kind():
     data, states, followings = with_views(batch())
     one_state, one_target = data.clone(), data.clone()
-    for key in (keys.PIXELS, keys.HOLDING):
+    for key in (keys.DEPTH, keys.HOLDING):
         one_state[key] = states[0][key]
         one_target[keys.NEXT, key] = followings[0][keys.NEXT, key]
     assert torch.isfinite(make(target_views=TARGET_VIEWS)(one_state)["loss_qvalue"])
@@ -516,8 +516,8 @@ def test_the_loss_equals_a_loop():
 def with_positives(data):
     data = data.clone()
     generator = torch.Generator().manual_seed(5)
-    shape = data[keys.PIXELS].shape
-    data[keys.POSITIVE, keys.PIXELS] = torch.rand(shape, generator=generator, dtype=torch.float64)
+    shape = data[keys.DEPTH].shape
+    data[keys.POSITIVE, keys.DEPTH] = torch.rand(shape, generator=generator, dtype=torch.float64)
     data[keys.POSITIVE, keys.HOLDING] = data[keys.HOLDING]
     return data
 
@@ -525,7 +525,7 @@ def with_positives(data):
 def features(loss, params, tree):
     weight = getattr(loss, params)["module", "net", "weight"].tolist()
     bias = getattr(loss, params)["module", "net", "bias"].tolist()
-    inputs = torch.cat([tree[keys.PIXELS], tree[keys.HOLDING].double()], dim=1).tolist()
+    inputs = torch.cat([tree[keys.DEPTH], tree[keys.HOLDING].double()], dim=1).tolist()
     return [[math.tanh(v) for v in affine(weight, bias, x)] for x in inputs]
 
 

@@ -18,14 +18,14 @@ class FlatActor(nn.Module):
         super().__init__()
         self.layer = nn.Linear(image_size**2 + 1, 2 * action_size)
 
-    def forward(self, pixels, holding):
-        loc, log_std = self.layer(flat(pixels, holding)).chunk(2, dim=-1)
+    def forward(self, depth, holding):
+        loc, log_std = self.layer(flat(depth, holding)).chunk(2, dim=-1)
         return loc, log_std.clamp(-5, 2).exp()
 
 
 class FlatEncoder(nn.Module):
-    def forward(self, pixels, holding):
-        return flat(pixels, holding)
+    def forward(self, depth, holding):
+        return flat(depth, holding)
 
 
 class FlatCritic(nn.Module):
@@ -38,8 +38,8 @@ class FlatCritic(nn.Module):
         return self.layers(torch.cat([features, action], dim=-1))
 
 
-def flat(pixels, holding):
-    return torch.cat([pixels.flatten(-3), holding.float()], dim=-1)
+def flat(depth, holding):
+    return torch.cat([depth.flatten(-3), holding.float()], dim=-1)
 
 
 @NETWORKS.register("mine/flat")
@@ -47,7 +47,7 @@ class FlatConfig(StrictModel):
     """Hyper-parameters of the linear actor-critic."""
 
     control: ClassVar[str] = "close_loop"
-    image_keys: ClassVar[tuple[str, ...]] = ("pixels",)
+    image_keys: ClassVar[tuple[str, ...]] = ("depth",)
     vector_keys: tuple[str, ...] = ()
     hidden: int = 8
 

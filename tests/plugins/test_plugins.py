@@ -119,7 +119,7 @@ env = gymnasium.make_vec(
 )
 observation, info = env.reset(seed=[0, 1])
 env.close()
-print(json.dumps(observation["pixels"].shape))
+print(json.dumps(observation["depth"].shape))
 """
     assert last_line(run(folder, "-c", code)) == [2, 1, 16, 16]
 
@@ -131,7 +131,7 @@ import json, ba_torchrl, my_tasks
 env = ba_torchrl.make_vector_env("mine/reach_near", 1, robot="mine/kuka", {SMALL})
 rollout = env.rollout(3)
 env.close()
-print(json.dumps(list(rollout["pixels"].shape)))
+print(json.dumps(list(rollout["depth"].shape)))
 """
     assert last_line(run(folder, "-c", code)) == [1, 3, 1, 16, 16]
 
@@ -154,7 +154,7 @@ class Here(BlockReaching):  # the cell of a notebook, run a second time
 
 def play(**options):
     env = ba_torchrl.make_vector_env("mine/here", 1, {SMALL}, **options)
-    shape = list(env.rollout(2)["pixels"].shape)
+    shape = list(env.rollout(2)["depth"].shape)
     env.close()
     return shape
 """

@@ -34,7 +34,7 @@ def batch(count=6):
         return torch.rand(count, *shape, generator=generator)
 
     def state():
-        return {keys.PIXELS: 0.3 * rand(1, PIXELS, PIXELS), keys.HOLDING: rand(1) < 0.5}
+        return {keys.DEPTH: 0.3 * rand(1, PIXELS, PIXELS), keys.HOLDING: rand(1) < 0.5}
 
     ended = rand(1) < 0.5
     ends = {keys.REWARD: rand(1), keys.DONE: ended, keys.TERMINATED: ended}
@@ -54,8 +54,8 @@ class Features(nn.Module):
         super().__init__()
         self.trunk = critic.trunk
 
-    def forward(self, pixels, holding):
-        return self.trunk(pixels, holding).flatten(1)
+    def forward(self, depth, holding):
+        return self.trunk(depth, holding).flatten(1)
 
 
 class Heads(nn.Module):
@@ -87,7 +87,7 @@ def test_network_and_losses_are_those_of_sacfd(escnn):
     qvalue = escnn.qvalue_loss(data)
     actor, log_prob = escnn.actor_loss(data)
     features = Features(escnn.critic)
-    observation = [keys.PIXELS, keys.HOLDING]
+    observation = [keys.DEPTH, keys.HOLDING]
     loss = SACfDLoss(
         squashed_gaussian_policy(escnn.actor, observation),
         TensorDictModule(features, observation, ["features"]),

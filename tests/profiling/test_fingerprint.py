@@ -38,7 +38,7 @@ def test_another_seed_is_a_difference_with_its_place_and_size(case):
     old = run_case(case)
     new = run_case(dataclasses.replace(case, seed=case.seed + 1))
     lines = compare({"small": old}, {"small": new})["small"]
-    assert any(line.startswith("expert 0: step 0: pixels: sum differs by ") for line in lines)
+    assert any(line.startswith("expert 0: step 0: depth: sum differs by ") for line in lines)
     assert any(line.startswith("random: step 1: action: difference ") for line in lines)
 
 

@@ -113,7 +113,7 @@ def test_scales_are_drawn_in_steps_and_visible_in_the_image(make):
         state = env.reset()
         edge = env.scene.task.block.shape.size_m[0]
         seen.add(round(edge / 0.05, 4))
-        depth = state["pixels"]
+        depth = state["depth"]
         assert float(depth.max() - depth[depth > 0].min()) == pytest.approx(edge, abs=1e-3)
     assert seen == {0.8, 0.82, 0.84, 0.86, 0.88, 0.9}
 

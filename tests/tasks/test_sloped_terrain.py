@@ -298,7 +298,7 @@ def test_the_ramps_cover_the_corners_of_any_workspace(world, width):
 @pytest.mark.parametrize("task", ["ramp/block_stacking", "bump/house_building_4"])
 def test_the_heightmap_shows_the_terrain(make_env, task):
     env = make_env(task, obs_size=64)
-    image = env.reset()["pixels"][0].numpy()
+    image = env.reset()["heightmap"][0].numpy()
     terrain = env.scene.task.terrain
     x, y = (
         low + (high - low) * (np.arange(64) + 0.5) / 64

@@ -313,13 +313,20 @@ def test_a_sealed_manifest_of_another_form_is_refused(run, content):
         load(run)
 
 
-def test_a_checkpoint_whose_weights_refer_to_kernels_of_other_signs_is_refused(run):
+@pytest.mark.parametrize(
+    ("adapter", "message"),
+    [
+        ("ba_torchrl.state", "does not fit this version"),  # kernels of other signs
+        ("ba_torchrl.state.2", "does not fit .*: the image with the key pixels .*; train again"),
+    ],
+)
+def test_a_checkpoint_of_another_version_is_refused(run, adapter, message):
     manifest = find_checkpoint(run, "latest") / "manifest.json"
     text = manifest.read_text()
-    assert '"ba_torchrl.state.2"' in text
-    manifest.write_text(text.replace("ba_torchrl.state.2", "ba_torchrl.state"))
+    assert '"ba_torchrl.state.3"' in text
+    manifest.write_text(text.replace("ba_torchrl.state.3", adapter))
     seal(manifest.parent)
-    with pytest.raises(ConfigError, match="does not fit this version"):
+    with pytest.raises(ConfigError, match=message):
         load(run, "latest")
 
 

@@ -119,14 +119,14 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
     state = experiment.algorithm.loss.state_dict()
     for key, value in loaded.loss.state_dict().items():
         assert torch.equal(value, state[key]), key
-    pixels = torch.rand(3, 1, 64, 64) * 0.3
+    depth = torch.rand(3, 1, 64, 64) * 0.3
     holding = torch.zeros(3, 1, dtype=torch.bool)
-    observation = TensorDict({"pixels": pixels, "holding": holding}, batch_size=[3])
+    observation = TensorDict({"depth": depth, "holding": holding}, batch_size=[3])
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
         a = experiment.algorithm.policy(observation.clone())
         b = loaded.policy(observation.clone())
     assert torch.equal(a["action"], b["action"])
-    assert set(a.keys()) == {"pixels", "holding", "action"}
+    assert set(a.keys()) == {"depth", "holding", "action"}
 
 
 def test_a_crash_while_saving_keeps_the_last_checkpoint(tmp_path, monkeypatch):
@@ -259,7 +259,7 @@ def test_demonstrations_of_another_library_are_those_of_the_folder(tmp_path):
     save_demonstrations(tmp_path / "folder", episodes, **options)
     export_demonstrations(tmp_path / "a.hdf5", episodes, format="hdf5", **options)
     shutil.copy(tmp_path / "a.hdf5", tmp_path / "b.hdf5")
-    names = {"pixels": "obs/pixels", "holding": "obs/holding", "action": "actions"}
+    names = {"depth": "obs/depth", "holding": "obs/holding", "action": "actions"}
     mapping = tmp_path / "mapping.yaml"
     mapping.write_text("".join(f"{key}: {name}\n" for key, name in names.items()))
     changes = {"demonstrations": 2}
@@ -277,7 +277,7 @@ def test_demonstrations_of_another_library_are_those_of_the_folder(tmp_path):
         found = gather_demonstrations(run, build_algorithm(run))
         for one, other in zip(found, episodes, strict=True):
             assert (one == other).all()
-    with pytest.raises(ConfigError, match=r"written by another program.*obs/pixels \[64, 64, 1\]"):
+    with pytest.raises(ConfigError, match=r"written by another program.*obs/depth \[64, 64, 1\]"):
         tiny(tmp_path, demonstrations_path=str(tmp_path / "b.hdf5"), **changes)
 
 
@@ -333,7 +333,7 @@ def test_another_view_can_be_used_for_training(tmp_path):
 @pytest.mark.parametrize("view", ["camera_center_xyzr", "camera_side"])
 def test_rotation_is_refused_for_views_that_do_not_rotate_with_the_scene(tmp_path, view):
     env = {**TINY["env"], "view_type": view}
-    with pytest.raises(ConfigError, match=r"pixels does not rotate.*use augmentation 'none'"):
+    with pytest.raises(ConfigError, match=r"depth does not rotate.*use augmentation 'none'"):
         Experiment(tiny(tmp_path, env=env), progress=False)
     plain = {**TINY["algorithm"], "augmentation": "none"}
     config = tiny(tmp_path, env=env, algorithm=plain, **SHORT)

@@ -65,7 +65,7 @@ def test_every_grade_has_its_card_and_executed_actions_only(folder, sets):
         assert (card["source"], card["episodes"]) == (grade, 4)
         assert card["success_rate"] == sum(successes) / 4
         assert card["mean_return"] == sum(returns) / 4
-        assert {"action", "pixels"} <= set(episodes[0].keys())
+        assert {"action", "depth"} <= set(episodes[0].keys())
         assert not {"expert_action", "is_expert"} & set(episodes[0].keys())
     assert read_metadata(folder / "expert")["success_rate"] == 1
     policy = read_metadata(folder / "medium")["policy"]

@@ -57,7 +57,7 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
 def test_an_observation_without_what_the_policy_reads_is_named(run):
     policy = ba_torchrl.load_policy(run)
     state = TensorDict({"holding": torch.zeros(1, dtype=torch.bool)}, batch_size=[])
-    with pytest.raises(ConfigError, match=r"reads pixels, which is not observed: policy\.make_env"):
+    with pytest.raises(ConfigError, match=r"reads depth, which is not observed: policy\.make_env"):
         policy(state)
 
 
@@ -73,12 +73,12 @@ def shipped():
 @pytest.mark.parametrize(
     ("control", "changes", "message"),
     [
-        ("open_loop", {"obs_size": 128}, r"pixels of shape \[1, 64, 64\], and this is \[1, 128"),
+        ("open_loop", {"obs_size": 128}, r"depth of shape \[1, 64, 64\], and this is \[1, 128"),
         ("open_loop", {"in_hand_size": 32}, r"in_hand of shape \[1, 24, 24\], and this is \[1, 32"),
         ("open_loop", {"action_sequence": "pyxr"}, "the environment takes .*'pyxr'"),
         ("open_loop", {"half_rotation": False}, "the environment takes .*half_rotation=False"),
-        ("close_loop", {"obs_size": 128}, r"pixels of shape \[1, 64, 64\], and this is \[1, 128"),
-        ("close_loop", {"obs_type": "vec"}, "reads pixels, which is not observed"),
+        ("close_loop", {"obs_size": 128}, r"depth of shape \[1, 64, 64\], and this is \[1, 128"),
+        ("close_loop", {"obs_type": "vec"}, "reads depth, which is not observed"),
         ("close_loop", {"action_sequence": "xyzpr"}, "the environment takes .*'xyzpr'"),
         ("close_loop", {"dpos": 0.02}, "the environment takes .*dpos_m=0.02"),
     ],

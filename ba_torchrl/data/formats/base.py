@@ -16,6 +16,7 @@ from safetensors.numpy import load_file
 
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.files import (
+    RENAMED,
     complete_only,
     fingerprint,
     json_bytes,
@@ -100,6 +101,7 @@ class Entry(StrictModel):
 class Card(StrictModel):
     """What is known of a file of demonstrations."""
 
+    card_format: Literal[2] = 2
     format: str
     task: str
     goal: str
@@ -288,7 +290,7 @@ def read_card(path: Path) -> Card | None:
     """Return the card of a file of demonstrations; None if it has none.
 
     Raises:
-        ConfigError: the card is damaged.
+        ConfigError: the card is damaged, or of another version.
     """
     file = card_file(path)
     if not file.exists():
@@ -298,13 +300,16 @@ def read_card(path: Path) -> Card | None:
         values = json.loads(text)
         if not isinstance(values, dict) or not {"format", "entries"} <= values.keys():
             return None  # somebody else's file of that name
-        return Card.model_validate_json(text)
+        card = Card.model_validate_json(text)
     except (OSError, ValueError, RecursionError) as error:
         what: Any = error
         if isinstance(error, ValidationError):
             first = error.errors()[0]
             what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise ConfigError(f"{file} is damaged: {what}") from None
+    if "card_format" not in values:
+        raise ConfigError(f"{file} is of another version: {RENAMED}; export again")
+    return card
 
 
 def _checksums(path: Path) -> dict[str, tuple[int, int]]:

@@ -43,7 +43,7 @@ class Robomimic(Format):
         return os.path.isfile(path) and path.suffix.lower() in self.suffixes
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
-        """Return names: ``obs/pixels``, ``actions``, ``rewards``, and other keys unchanged."""
+        """Return names: ``obs/depth``, ``actions``, ``rewards``, and other keys unchanged."""
         fixed = {keys.ACTION: "actions", keys.REWARD: "rewards", keys.INSTRUCTION: _LANGUAGE}
         return {
             key: fixed.get(key, f"{_OBS}{key}" if entry.role == "observation" else key)

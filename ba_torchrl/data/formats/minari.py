@@ -54,7 +54,7 @@ class Minari(Format):
         return os.path.isfile(path / "data" / "metadata.json")
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
-        """Return names: ``observations/pixels``, ``actions``, ``infos/success``."""
+        """Return names: ``observations/depth``, ``actions``, ``infos/success``."""
         observed = {
             key: entry.role == "observation" and key != keys.INSTRUCTION
             for key, entry in entries.items()

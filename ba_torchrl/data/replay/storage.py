@@ -169,7 +169,7 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
 
     Args:
         max_size: number of transitions.
-        codecs: codec of each image by its key, such as ``pixels``; also used for the same key in
+        codecs: codec of each image by its key, such as ``depth``; also used for the same key in
             "next".
         returns_codes: return the images' codes instead of decoded images.
 

@@ -42,10 +42,10 @@ class PlainActor(nn.Module):
         self.loc = loc
         self.log_std = log_std
 
-    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (loc, scale), each [..., A], of pixels [..., C, H, W], holding [..., 1] and
+    def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of depth [..., C, H, W], holding [..., 1] and
         vectors, which are appended to the features of the policy."""
-        features = self.head(self.trunk(pixels, holding))
+        features = self.head(self.trunk(depth, holding))
         features = torch.cat([features, *vectors], dim=-1) if vectors else features
         return self.loc(features), scale_from_log_std(self.log_std(features))
 

@@ -148,9 +148,9 @@ class EquivariantEncoder(nn.Module):
         self.trunk = trunk
         self.pose = pose
 
-    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
-        """Return fields [..., F] of pixels [..., C, H, W], holding [..., 1] and ``proprio``."""
-        return self.trunk(pixels, holding, *self.pose.fields(vectors))
+    def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
+        """Return fields [..., F] of depth [..., C, H, W], holding [..., 1] and ``proprio``."""
+        return self.trunk(depth, holding, *self.pose.fields(vectors))
 
 
 def steerable_linear(gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes) -> nn.Module:
@@ -212,10 +212,10 @@ class EquivariantActor(nn.Module):
         outputs = action.types(gspace, extra_invariants=action.size)
         self.head = SteerableLinear(gspace, features, outputs)
 
-    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (loc, scale), each [..., A], of pixels [..., C, H, W], holding [..., 1] and, if it
+    def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
+        """Return (loc, scale), each [..., A], of depth [..., C, H, W], holding [..., 1] and, if it
         is observed, ``proprio`` [..., 8]."""
-        fields = self.head(self.trunk(pixels, holding, *self.pose.fields(vectors)))
+        fields = self.head(self.trunk(depth, holding, *self.pose.fields(vectors)))
         loc, log_std = fields.split(self.action.size, dim=-1)
         return self.action.ungroup(loc), scale_from_log_std(log_std)
 

@@ -34,9 +34,9 @@ class FERMEncoder(nn.Module):
         self.trunk = trunk
         self.head = _normalised(width, features)
 
-    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
-        """Return features [..., F] of pixels [..., C, H, W] and holding [..., 1], then vectors."""
-        features = self.head(self.trunk(pixels, holding))
+    def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
+        """Return features [..., F] of depth [..., C, H, W] and holding [..., 1], then vectors."""
+        features = self.head(self.trunk(depth, holding))
         return torch.cat([features, *vectors], dim=-1) if vectors else features
 
 

@@ -69,7 +69,7 @@ class ImageNetworkConfig(StrictModel):
     """
 
     control: ClassVar[Control] = "close_loop"
-    image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS,)
+    image_keys: ClassVar[tuple[str, ...]] = (keys.DEPTH,)
     shares_encoder: ClassVar[bool] = False
     """Whether the policy sees features of the critics' encoder."""
 
@@ -120,10 +120,10 @@ class ImageTrunk(nn.Module):
         self.pools = tuple(pools)
         self.config = config
 
-    def forward(self, pixels: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
-        """Return features [..., F] of pixels [..., C, H, W], holding [..., 1] and vectors."""
-        leading = pixels.shape[:-3]
-        x = self._input(pixels.flatten(0, -4) if leading else pixels[None], holding)
+    def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
+        """Return features [..., F] of depth [..., C, H, W], holding [..., 1] and vectors."""
+        leading = depth.shape[:-3]
+        x = self._input(depth.flatten(0, -4) if leading else depth[None], holding)
         slope = self.config.negative_slope
         for conv, pool in zip(self.convs, self.pools, strict=True):
             x = conv(x)
@@ -134,16 +134,16 @@ class ImageTrunk(nn.Module):
         features = x.flatten(1).float().reshape(*leading, -1)
         return torch.cat([features, *vectors], dim=-1) if vectors else features
 
-    def _input(self, pixels: Tensor, holding: Tensor) -> Tensor:
+    def _input(self, depth: Tensor, holding: Tensor) -> Tensor:
         """Return the input of the first convolution [B, C', H, W], channels-last."""
-        dtype = compute_dtype(self.config.precision, pixels.device)
+        dtype = compute_dtype(self.config.precision, depth.device)
         center, scale = self.config.depth_center_m, self.config.depth_scale_m
         if self.config.depth_reference == "floor":
-            floor = pixels.amax((-2, -1), keepdim=True)
-            parts = [(floor - pixels) / scale, ((floor - center) / scale).expand_as(pixels)]
+            floor = depth.amax((-2, -1), keepdim=True)
+            parts = [(floor - depth) / scale, ((floor - center) / scale).expand_as(depth)]
         else:
-            parts = [pixels if (center, scale) == (0, 1) else (pixels - center) / scale]
-        parts.append(holding.reshape(-1, 1, 1, 1).expand(-1, 1, *pixels.shape[-2:]))
+            parts = [depth if (center, scale) == (0, 1) else (depth - center) / scale]
+        parts.append(holding.reshape(-1, 1, 1, 1).expand(-1, 1, *depth.shape[-2:]))
         channels_last = [part.movedim(1, -1).to(dtype) for part in parts]
         return torch.cat(channels_last, dim=-1).movedim(-1, 1)
 

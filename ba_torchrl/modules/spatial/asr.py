@@ -45,7 +45,7 @@ View = Callable[[Tensor, Tensor], Tensor]
 class ASRState(NamedTuple):
     """Inputs of the later levels besides the choices: the images and the first level's features."""
 
-    pixels: Tensor
+    heightmap: Tensor
     in_hand: Tensor
     holding: Tensor
     scene: Tensor
@@ -58,7 +58,7 @@ class ASR(SpatialQNetwork):
     first level's encoder.
 
     Args:
-        positions: (pixels, in_hand, holding) -> (values [B, 1, H, W], scene feature map).
+        positions: (heightmap, in_hand, holding) -> (values [B, 1, H, W], scene feature map).
         later: for each later level, its view of the heightmap around the chosen pixel, and its
             head: (view, in_hand, scene feature map, holding) -> values [B, n].
         levels: pixels, then one component each.
@@ -79,10 +79,10 @@ class ASR(SpatialQNetwork):
         self.levels = tuple(levels)
         self.limits = dict(limits or {})
 
-    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, ASRState]:
+    def first(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, ASRState]:
         """Return the Q values [B, H, W] of the pixels, and the state for `later`."""
-        values, scene = self.positions(pixels, in_hand, holding)
-        return values.squeeze(1), ASRState(pixels, in_hand, holding, scene)
+        values, scene = self.positions(heightmap, in_hand, holding)
+        return values.squeeze(1), ASRState(heightmap, in_hand, holding, scene)
 
     def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
         """Return the Q values [B, n] of a component, given the choices [B, m] before it.
@@ -94,7 +94,7 @@ class ASR(SpatialQNetwork):
             raise ValueError(
                 f"the later levels of this network are 1 to {len(self.levels) - 1}, got {level}"
             )
-        view = self.views[level - 1](state.pixels, chosen)
+        view = self.views[level - 1](state.heightmap, chosen)
         return self.heads[level - 1](view, state.in_hand, state.scene, state.holding)
 
 

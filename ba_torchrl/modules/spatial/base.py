@@ -49,7 +49,7 @@ class SpatialSpec:
     @property
     def image_size(self) -> int:
         """Rows and columns of the heightmap."""
-        return self.images[keys.PIXELS].size
+        return self.images[keys.HEIGHTMAP].size
 
     @property
     def pixel_m(self) -> float:
@@ -93,11 +93,11 @@ class SpatialQNetwork(nn.Module, ABC):
     an entry span the range of the action."""
 
     @abstractmethod
-    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
+    def first(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
         """Return the Q values of the first level, and the state that `later` needs.
 
         Args:
-            pixels: heightmaps [B, 1, H, W], metres.
+            heightmap: heightmaps [B, 1, H, W], metres.
             in_hand: images of what is held [B, C, h, w].
             holding: [B, 1], true where an object is held; follows all input images.
 
@@ -141,7 +141,7 @@ class SpatialImageConfig(StrictModel):
     """
 
     control: ClassVar[Control] = "open_loop"
-    image_keys: ClassVar[tuple[str, ...]] = (keys.PIXELS, keys.IN_HAND)
+    image_keys: ClassVar[tuple[str, ...]] = (keys.HEIGHTMAP, keys.IN_HAND)
     vector_keys: ClassVar[tuple[str, ...]] = ()
 
     precision: Precision = "auto"

@@ -122,11 +122,11 @@ class EquivariantPixelValues(nn.Module):
         self.pick = _Head(gspace, fields[0], out_repr)
         self.place = _Head(gspace, fields[0], out_repr)
 
-    def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return values and the invariant bottleneck map.
 
         Args:
-            pixels: heightmaps [B, 1, H, W].
+            heightmap: heightmaps [B, 1, H, W].
             in_hand: [B, C, h, w]; used for the samples in which an object is held.
             holding: [B, 1].
 
@@ -136,12 +136,12 @@ class EquivariantPixelValues(nn.Module):
         """
         is_holding = holding.reshape(-1).bool()
         if holding.device.type == "cpu" and not torch.compiler.is_compiling():
-            return self._sorted_values(pixels, in_hand, is_holding)
-        return self._selected_values(pixels, in_hand, is_holding)
+            return self._sorted_values(heightmap, in_hand, is_holding)
+        return self._selected_values(heightmap, in_hand, is_holding)
 
-    def _fields(self, pixels: Tensor) -> tuple[Tensor, Tensor]:
+    def _fields(self, heightmap: Tensor) -> tuple[Tensor, Tensor]:
         """Return the regular fields of every pixel and the invariant bottleneck map."""
-        maps = self.unet.encode(self.config.heights(pixels))
+        maps = self.unet.encode(self.config.heights(heightmap))
         return self.unet.decode(maps), maps[-1].unflatten(1, (-1, self._group_size)).amax(dim=2)
 
     def _place_values(self, fields: Tensor, in_hand: Tensor) -> Tensor:
@@ -149,7 +149,7 @@ class EquivariantPixelValues(nn.Module):
         return self.place(F.relu(self.held(fields, coefficients)))
 
     def _sorted_values(
-        self, pixels: Tensor, in_hand: Tensor, is_holding: Tensor
+        self, heightmap: Tensor, in_hand: Tensor, is_holding: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return `forward`'s result, with one head for each sample.
 
@@ -159,20 +159,20 @@ class EquivariantPixelValues(nn.Module):
         order = is_holding.long().argsort(stable=True)
         full = int(is_holding.sum())
         parts = [len(order) - full, full]
-        fields, scene = self._fields(pixels[order])
+        fields, scene = self._fields(heightmap[order])
         opened, filled = fields.split(parts)
         places = self._place_values(filled, in_hand[order[parts[0] :]])
         restore = order.argsort()
         return torch.cat([self.pick(opened), places])[restore], scene[restore]
 
     def _selected_values(
-        self, pixels: Tensor, in_hand: Tensor, is_holding: Tensor
+        self, heightmap: Tensor, in_hand: Tensor, is_holding: Tensor
     ) -> tuple[Tensor, Tensor]:
         """Return `forward`'s result, with both heads for each sample.
 
         Shapes do not depend on the data, and the host reads no result.
         """
-        fields, scene = self._fields(pixels)
+        fields, scene = self._fields(heightmap)
         places = self._place_values(fields, in_hand)
         values = torch.where(is_holding[:, None, None, None], places, self.pick(fields))
         return values, scene

@@ -27,7 +27,7 @@ class FCN(SpatialQNetwork):
     """One level of choices: all pixels, or all pairs of a yaw and a pixel.
 
     Args:
-        values: (pixels, in_hand, holding) -> (values [B, maps, H, W], bottleneck map).
+        values: (heightmap, in_hand, holding) -> (values [B, maps, H, W], bottleneck map).
         image_size: rows and columns of the heightmap.
         num_yaws: number of yaws, with one map each; None for a single map without yaws.
     """
@@ -41,9 +41,9 @@ class FCN(SpatialQNetwork):
         else:
             self.levels = (Level(("rz", "x", "y"), (num_yaws, *pixels)),)
 
-    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
+    def first(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
         """Return the Q values [B, H, W] or [B, yaws, H, W], and None as the state."""
-        values, _ = self.values(pixels, in_hand, holding)
+        values, _ = self.values(heightmap, in_hand, holding)
         return values.reshape(-1, *self.levels[0].shape), None
 
 

@@ -159,7 +159,7 @@ class SpatialValues(nn.Module):
         self,
         network: SpatialQNetwork,
         actions: SpatialActions,
-        image_keys: Sequence[str] = (keys.PIXELS, keys.IN_HAND),
+        image_keys: Sequence[str] = (keys.HEIGHTMAP, keys.IN_HAND),
     ) -> None:
         super().__init__()
         self.network = network
@@ -246,11 +246,11 @@ class SpatialPolicy(nn.Module):
             indices = torch.where(explores.to(indices.device)[:, None], random, indices)
         return self.values.actions.to_action(indices, holding).reshape(*leading, -1)
 
-    def _random_indices(self, pixels: Tensor) -> Tensor:
+    def _random_indices(self, heightmap: Tensor) -> Tensor:
         """Return random choices, int64 [B, n]."""
         actions = self.values.actions
-        count, width = len(pixels), pixels.shape[-1]
-        weights = (pixels[:, 0] > OBJECT_HEIGHT_M).flatten(1).float().cpu()
+        count, width = len(heightmap), heightmap.shape[-1]
+        weights = (heightmap[:, 0] > OBJECT_HEIGHT_M).flatten(1).float().cpu()
         weights[weights.sum(dim=1) == 0] = 1.0
         pixel = torch.multinomial(weights, 1, generator=self.generator)[:, 0]
         columns = {"x": pixel // width, "y": pixel % width}

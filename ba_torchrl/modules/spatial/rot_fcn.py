@@ -27,7 +27,7 @@ class RotFCN(SpatialQNetwork):
     """Rotates the image into the frame of each yaw, computes pixel values, and rotates them back.
 
     Args:
-        values: (pixels, in_hand, holding) -> (values [n*B, 1, P, P], bottleneck map), of n views.
+        values: (heightmap, in_hand, holding) -> (values [n*B, 1, P, P], bottleneck map) of n views.
         image_size: rows and columns of the heightmap.
         num_yaws: number of yaws.
         half_rotation: whether the yaws span half a turn.
@@ -43,14 +43,14 @@ class RotFCN(SpatialQNetwork):
         # Large enough for the image at any angle: 90 pixels become 128.
         self.padded_size = math.ceil(image_size * math.sqrt(2) / UNET_STRIDE) * UNET_STRIDE
 
-    def first(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
+    def first(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Any]:
         """Return the Q values [B, yaws, H, W], and None as the state."""
         num_yaws, size, _ = self.levels[0].shape
-        padded, batch = self.padded_size, len(pixels)
-        yaws = yaws_rad(num_yaws, self.half_rotation, pixels.device)
-        centers = pixels.new_full((num_yaws, 2), size / 2)
+        padded, batch = self.padded_size, len(heightmap)
+        yaws = yaws_rad(num_yaws, self.half_rotation, heightmap.device)
+        centers = heightmap.new_full((num_yaws, 2), size / 2)
         # The sampling grid of a view is the same for all images, so the batch becomes its channels.
-        images = pixels[:, 0].expand(num_yaws, -1, -1, -1)
+        images = heightmap[:, 0].expand(num_yaws, -1, -1, -1)
         views = sample(images, sampling_grid(centers, yaws, padded, size))
         values, _ = self.values(views.reshape(-1, 1, padded, padded), in_hand, holding)
         values = values.reshape(num_yaws, batch, padded, padded)

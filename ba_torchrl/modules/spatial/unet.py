@@ -123,23 +123,22 @@ class PlainPixelValues(nn.Module):
         self.scene_channels = w8
         self.apply(initialise_plain)
 
-    def forward(self, pixels: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return values and the bottleneck map.
 
         Args:
-            pixels: n views of the B heightmaps [n*B, 1, H, W]; the index of the view is the outer
-                one.
+            heightmap: n views of each of B [n*B, 1, H, W]; the index of the view is the outer one.
             in_hand: [B, C, h, w].
             holding: [B, 1], which picks the primitive.
 
         Returns:
             float32 [n*B, maps, H, W], and [n*B, scene_channels, H/16, W/16].
         """
-        *skips, inner = self.unet.encode(self.config.heights(pixels))
+        *skips, inner = self.unet.encode(self.config.heights(heightmap))
         hand = self.hand(self.config.in_hand(in_hand))
         if hand.shape[-2:] != inner.shape[-2:]:
             hand = F.interpolate(hand, inner.shape[-2:], mode="bilinear", align_corners=False)
-        views = len(pixels) // len(in_hand)
+        views = len(heightmap) // len(in_hand)
         fused = torch.cat([inner, hand.repeat(views, 1, 1, 1)], dim=1)
         scene = self.fuse(fused.contiguous(memory_format=torch.channels_last))
         # bfloat16 would round values near one to multiples of 1/256, so many pixels would share the

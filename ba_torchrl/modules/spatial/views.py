@@ -157,12 +157,12 @@ class HeightView:
     rz_rad: tuple[float, ...] | None = None
     channels: ClassVar[int] = 1
 
-    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+    def __call__(self, heightmap: Tensor, chosen: Tensor) -> Tensor:
         """Return one patch per sample [B, 1, 1, p, p], metres."""
         yaw = None
         if self.rz_rad is not None:
-            yaw = constants(tuple(self.rz_rad), pixels.device).to(pixels.dtype)[chosen[:, 2]]
-        return patches(pixels, chosen[:, :2], self.size, yaw)[:, None]
+            yaw = constants(tuple(self.rz_rad), heightmap.device).to(heightmap.dtype)[chosen[:, 2]]
+        return patches(heightmap, chosen[:, :2], self.size, yaw)[:, None]
 
 
 @dataclass(frozen=True)
@@ -180,11 +180,12 @@ class UprightView:
     size: int
     channels: ClassVar[int] = 3
 
-    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+    def __call__(self, heightmap: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, K, 3, p, p], voxels."""
-        patch = patches(pixels, chosen[:, :2], self.size)[:, 0]
+        patch = patches(heightmap, chosen[:, :2], self.size)[:, 0]
         heights, yaws = (
-            constants(tuple(values), pixels.device) for values in (self.grid.z_m, self.grid.rz_rad)
+            constants(tuple(values), heightmap.device)
+            for values in (self.grid.z_m, self.grid.rz_rad)
         )
         z = heights.expand(len(patch), -1) if chosen.shape[1] == 3 else heights[chosen[:, 3:4]]
         return project_upright(patch, self.pixel_m, z, yaws[chosen[:, 2]])
@@ -206,13 +207,13 @@ class TiltedView:
     size: int
     channels: ClassVar[int] = 3
 
-    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+    def __call__(self, heightmap: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, K, 3, p, p], voxels; ry is the outer index of the poses."""
-        patch = patches(pixels, chosen[:, :2], self.size)[:, 0]
-        table = cell_table(*self.grid[1:], self.size, pixels.device)
+        patch = patches(heightmap, chosen[:, :2], self.size)[:, 0]
+        table = cell_table(*self.grid[1:], self.size, heightmap.device)
         cells = table[(chosen[:, 2], *chosen[:, 4:].unbind(1))]
         cells = cells.reshape(len(patch), -1, *cells.shape[-3:])
-        heights = constants(tuple(self.grid.z_m), pixels.device)
+        heights = constants(tuple(self.grid.z_m), heightmap.device)
         z = heights[chosen[:, 3:4]].expand(-1, cells.shape[1])
         return project(patch, self.pixel_m, z, cells)
 
@@ -228,7 +229,7 @@ class BothFingerOrders:
         """Channels of a projection."""
         return self.view.channels
 
-    def __call__(self, pixels: Tensor, chosen: Tensor) -> Tensor:
+    def __call__(self, heightmap: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, 2 K, 3, p, p], voxels."""
         swapped = replace(self.view, grid=self.view.grid.with_swapped_fingers())
-        return torch.cat([self.view(pixels, chosen), swapped(pixels, chosen)], dim=1)
+        return torch.cat([self.view(heightmap, chosen), swapped(heightmap, chosen)], dim=1)

@@ -52,7 +52,7 @@ def centre_of(image):
 
 def batch(places, yaws=None, sequence="pxyr"):
     count = len(places)
-    pixels = torch.stack([spot(x, y) for x, y in places])
+    heightmap = torch.stack([spot(x, y) for x, y in places])
     columns = {
         "p": torch.zeros(count),
         "x": torch.tensor([x for x, _ in places]),
@@ -62,10 +62,10 @@ def batch(places, yaws=None, sequence="pxyr"):
     in_hand = torch.arange(16.0).reshape(1, 1, 4, 4).repeat(count, 1, 1, 1)
     return TensorDict(
         {
-            "pixels": pixels,
+            "heightmap": heightmap,
             "in_hand": in_hand,
             "action": torch.stack([columns[letter] for letter in sequence], dim=1),
-            "next": {"pixels": pixels.clone(), "in_hand": in_hand.clone()},
+            "next": {"heightmap": heightmap.clone(), "in_hand": in_hand.clone()},
         },
         batch_size=[count],
     )
@@ -104,11 +104,11 @@ def test_the_action_follows_its_target_in_the_image(transforms, settings):
     data = batch(places)
     out = augmentation(transforms, layout(), seed=0, **settings)(data)
     assert not torch.allclose(out["action"], data["action"])
-    for image, action in zip(out["pixels"], out["action"], strict=True):
+    for image, action in zip(out["heightmap"], out["action"], strict=True):
         x, y = centre_of(image)
         assert abs(x - action[1]) < 1e-3
         assert abs(y - action[2]) < 1e-3
-    assert torch.equal(out["pixels"], out["next", "pixels"])  # were equal, and moved alike
+    assert torch.equal(out["heightmap"], out["next", "heightmap"])  # were equal, and moved alike
     assert torch.equal(data["action"], batch(places)["action"])  # the input stays
 
 
@@ -134,9 +134,9 @@ def direction_of(image):
 def test_the_yaw_rotates_with_the_scene(transforms):
     yaws = [0.1 + 0.28 * i for i in range(11)] * 5
     data = batch([(0.45, 0.0)] * len(yaws), yaws)
-    data["pixels"] = torch.stack([bar(yaw) for yaw in yaws])
+    data["heightmap"] = torch.stack([bar(yaw) for yaw in yaws])
     out = augmentation(transforms, layout(), seed=1, order=8)(data)
-    for image, yaw in zip(out["pixels"], out["action"][:, 3].tolist(), strict=True):
+    for image, yaw in zip(out["heightmap"], out["action"][:, 3].tolist(), strict=True):
         assert 0 <= yaw <= math.pi + 1e-6
         if transforms != "se2":  # shifted bars are not about the middle
             off = (direction_of(image) - yaw + math.pi / 2) % math.pi - math.pi / 2
@@ -263,7 +263,7 @@ def test_another_action_is_transformed_alone():
     data["target_action"], data["action"] = data["action"].clone(), torch.zeros_like(data["action"])
     out = augmentation("se2", layout(), seed=0, action_key=keys.TARGET_ACTION)(data)
     assert torch.equal(out["target_action"], expected["action"])
-    assert torch.equal(out["pixels"], expected["pixels"])
+    assert torch.equal(out["heightmap"], expected["heightmap"])
     assert "action" not in out
 
 

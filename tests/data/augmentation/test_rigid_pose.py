@@ -31,7 +31,7 @@ def augmentation(transforms, half_rotation=True, **settings):
 def transitions(heightmap, actions, in_hand):
     count = len(actions)
     images = {
-        "pixels": torch.from_numpy(heightmap).float().expand(count, 1, -1, -1),
+        "heightmap": torch.from_numpy(heightmap).float().expand(count, 1, -1, -1),
         "in_hand": torch.from_numpy(in_hand).float().expand(count, -1, -1, -1),
     }
     following = {key: value.clone() for key, value in images.items()}
@@ -64,7 +64,7 @@ def test_the_pose_rotates_with_the_scene(transforms, order, half_rotation):
     out = augmentation(transforms, half_rotation, order=order)(data)
     swapped = 0
     for image, before, after in zip(
-        out["pixels"], action, out["action"].double().numpy(), strict=True
+        out["heightmap"], action, out["action"].double().numpy(), strict=True
     ):
         x, y = place_of(image)
         assert after[[0, 3]] == pytest.approx(before[[0, 3]], abs=1e-6)  # primitive and z
@@ -105,10 +105,10 @@ def test_the_projections_equal_those_of_a_pick_in_the_transformed_scene(tilts):
     out = augmentation("cn", order=4)(data)
     seen = set()
     for pixels, image, following, moved in zip(
-        out["pixels"], out["in_hand"], out["next", "in_hand"], out["action"], strict=True
+        out["heightmap"], out["in_hand"], out["next", "in_hand"], out["action"], strict=True
     ):
         (turn,) = (
-            k for k in range(4) if np.array_equal(np.rot90(data["pixels"][0, 0], k), pixels[0])
+            k for k in range(4) if np.array_equal(np.rot90(data["heightmap"][0, 0], k), pixels[0])
         )
         wanted = torch.from_numpy(in_hand(np.rot90(heights, turn), moved)).float()
         assert torch.equal(image, following)

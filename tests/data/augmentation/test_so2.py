@@ -16,7 +16,7 @@ from ba_torchrl.data.augmentation.so2 import (
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 
-IMAGES = {"pixels": ImageSpec(1, 32, 0.4)}
+IMAGES = {"depth": ImageSpec(1, 32, 0.4)}
 
 
 def angles(*values):
@@ -31,10 +31,10 @@ def batch(n=32, size=32, actions=5):
 
     return TensorDict(
         {
-            keys.PIXELS: rand(n, 1, size, size),
+            keys.DEPTH: rand(n, 1, size, size),
             keys.ACTION: rand(n, actions) * 2 - 1,
             keys.HOLDING: rand(n, 1) > 0.5,
-            keys.NEXT: {keys.PIXELS: rand(n, 1, size, size), keys.REWARD: rand(n, 1)},
+            keys.NEXT: {keys.DEPTH: rand(n, 1, size, size), keys.REWARD: rand(n, 1)},
         },
         [n],
     )
@@ -123,8 +123,8 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
     # Images that show their action: a spot at 0.6 (dx, dy), another at its opposite.
     for i in range(len(data)):
         dx, dy = 0.6 * data[keys.ACTION][i, [x, y]]
-        data[keys.PIXELS][i, 0] = blob(dx, dy, 32)
-        data[keys.NEXT, keys.PIXELS][i, 0] = blob(-dx, -dy, 32)
+        data[keys.DEPTH][i, 0] = blob(dx, dy, 32)
+        data[keys.NEXT, keys.DEPTH][i, 0] = blob(-dx, -dy, 32)
     shown = data.clone()
     out = SO2Augmentation(IMAGES, sequence, seed=3, probability=1.0)(data)
     assert (data == shown).all()  # the input is not changed
@@ -135,9 +135,9 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
     assert (moved[:, [x, y]].sum(-1) > 1e-3).float().mean() > 0.9
     for i in range(len(data)):
         wanted = (0.6 * out[keys.ACTION][i, [x, y]]).tolist()
-        assert centroid(out[keys.PIXELS][i, 0]) == pytest.approx(wanted, abs=0.02)
+        assert centroid(out[keys.DEPTH][i, 0]) == pytest.approx(wanted, abs=0.02)
         opposite = [-v for v in wanted]
-        assert centroid(out[keys.NEXT, keys.PIXELS][i, 0]) == pytest.approx(opposite, abs=0.02)
+        assert centroid(out[keys.NEXT, keys.DEPTH][i, 0]) == pytest.approx(opposite, abs=0.02)
     assert torch.equal(out[keys.HOLDING], data[keys.HOLDING])
     assert torch.equal(out[keys.NEXT, keys.REWARD], data[keys.NEXT, keys.REWARD])
 
@@ -147,7 +147,7 @@ def test_probability():
     for probability in (0.0, 0.8, 1.0):
         out = SO2Augmentation(IMAGES, "pxyzr", seed=0, probability=probability)(data)
         same = (out[keys.ACTION] == data[keys.ACTION]).all(-1)
-        same_image = (out[keys.PIXELS] == data[keys.PIXELS]).flatten(1).all(-1)
+        same_image = (out[keys.DEPTH] == data[keys.DEPTH]).flatten(1).all(-1)
         assert torch.equal(same, same_image)
         assert 1 - same.float().mean().item() == pytest.approx(probability, abs=0.04)
 
@@ -172,11 +172,11 @@ def test_draws_come_from_the_modules_own_generator():
     torch.manual_seed(1)
     assert (two(data) == first).all()
     second = one(data)
-    assert not torch.equal(second[keys.PIXELS], first[keys.PIXELS])  # another view
+    assert not torch.equal(second[keys.DEPTH], first[keys.DEPTH])  # another view
     two.load_state_dict(copy.deepcopy(one.state_dict()))
     assert (two(data) == one(data)).all()
     other = SO2Augmentation(IMAGES, "pxyzr", seed=6)(data)
-    assert not torch.equal(other[keys.PIXELS], first[keys.PIXELS])
+    assert not torch.equal(other[keys.DEPTH], first[keys.DEPTH])
 
 
 def test_invalid_arguments_are_refused():
@@ -203,5 +203,5 @@ def test_each_transition_is_followed_by_its_rotated_copies():
         old, new = original[keys.ACTION], copy[keys.ACTION]
         assert torch.equal(old[[0, 3, 4]], new[[0, 3, 4]])
         angle = (torch.atan2(new[2], new[1]) - torch.atan2(old[2], old[1]))[None].double()
-        turned = rotate_images(original[keys.PIXELS][None], angle)[0]
-        torch.testing.assert_close(copy[keys.PIXELS], turned, atol=2e-4, rtol=0)
+        turned = rotate_images(original[keys.DEPTH][None], angle)[0]
+        torch.testing.assert_close(copy[keys.DEPTH], turned, atol=2e-4, rtol=0)

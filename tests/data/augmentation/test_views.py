@@ -19,14 +19,14 @@ SIZE = 10
 
 def batch(count=6, size=SIZE):
     """Transitions whose pixels are all different."""
-    pixels = torch.arange(count * size * size, dtype=torch.float32).reshape(count, 1, size, size)
+    depth = torch.arange(count * size * size, dtype=torch.float32).reshape(count, 1, size, size)
     holding = torch.arange(count)[:, None] % 2 == 0
     return TensorDict(
         {
-            keys.PIXELS: pixels,
+            keys.DEPTH: depth,
             keys.HOLDING: holding,
             keys.ACTION: torch.rand(count, 5),
-            keys.NEXT: {keys.PIXELS: pixels + 0.5, keys.HOLDING: ~holding},
+            keys.NEXT: {keys.DEPTH: depth + 0.5, keys.HOLDING: ~holding},
         },
         [count],
     )
@@ -96,12 +96,12 @@ def test_a_crop_has_the_same_offset_in_image_and_next_image():
     out = RandomViews(close_loop_images(SIZE), size=7, seed=0)(data)
     found = set()
     for i in range(len(data)):
-        assert out[keys.PIXELS].shape == (6, 1, 7, 7)
-        offset = offset_of(out[keys.PIXELS][i], data[keys.PIXELS][i])
-        assert offset == offset_of(out[keys.NEXT, keys.PIXELS][i], data[keys.NEXT, keys.PIXELS][i])
+        assert out[keys.DEPTH].shape == (6, 1, 7, 7)
+        offset = offset_of(out[keys.DEPTH][i], data[keys.DEPTH][i])
+        assert offset == offset_of(out[keys.NEXT, keys.DEPTH][i], data[keys.NEXT, keys.DEPTH][i])
         found.add(offset)
     assert len(found) > 1
-    assert data[keys.PIXELS].shape[-1] == SIZE  # the batch itself is unchanged
+    assert data[keys.DEPTH].shape[-1] == SIZE  # the batch itself is unchanged
 
 
 def test_every_offset_occurs_and_no_other():
@@ -110,7 +110,7 @@ def test_every_offset_occurs_and_no_other():
     out = augment(data)
     found = {
         offset_of(view, image, padding=1)
-        for view, image in zip(out[keys.PIXELS], data[keys.PIXELS], strict=True)
+        for view, image in zip(out[keys.DEPTH], data[keys.DEPTH], strict=True)
     }
     assert found == {(row, column) for row in range(3) for column in range(3)}
 
@@ -118,17 +118,17 @@ def test_every_offset_occurs_and_no_other():
 def test_several_views_have_offsets_of_their_own():
     data = batch()
     out = views(padding=2, views=3, target_views=2)(data)
-    assert out[keys.PIXELS].shape == (6, 3, 1, SIZE, SIZE)
-    assert out[keys.NEXT, keys.PIXELS].shape == (6, 2, 1, SIZE, SIZE)
+    assert out[keys.DEPTH].shape == (6, 3, 1, SIZE, SIZE)
+    assert out[keys.NEXT, keys.DEPTH].shape == (6, 2, 1, SIZE, SIZE)
     different = 0
     for i in range(len(data)):
-        offsets = {offset_of(v, data[keys.PIXELS][i], padding=2) for v in out[keys.PIXELS][i]}
+        offsets = {offset_of(v, data[keys.DEPTH][i], padding=2) for v in out[keys.DEPTH][i]}
         different += len(offsets)
-        for view in out[keys.NEXT, keys.PIXELS][i]:
-            offset_of(view, data[keys.NEXT, keys.PIXELS][i], padding=2)
+        for view in out[keys.NEXT, keys.DEPTH][i]:
+            offset_of(view, data[keys.NEXT, keys.DEPTH][i], padding=2)
     assert different > 12
     # several views of one of them only
-    assert views(padding=2, target_views=2)(data)[keys.PIXELS].shape == (6, 1, SIZE, SIZE)
+    assert views(padding=2, target_views=2)(data)[keys.DEPTH].shape == (6, 1, SIZE, SIZE)
 
 
 def test_the_holding_flag_and_the_action_are_unchanged_in_every_view():
@@ -149,7 +149,7 @@ def test_a_positive_is_another_view_of_the_same_image():
     pairs = [
         (offset_of(view, image), offset_of(positive, image))
         for view, positive, image in zip(
-            out[keys.PIXELS], out[keys.POSITIVE, keys.PIXELS], data[keys.PIXELS], strict=True
+            out[keys.DEPTH], out[keys.POSITIVE, keys.DEPTH], data[keys.DEPTH], strict=True
         )
     ]
     assert any(first != second for first, second in pairs)
@@ -164,18 +164,18 @@ def test_the_centre_crop_is_in_the_middle(height, start):
 
 
 def test_declarations_have_the_size_of_the_crop_and_small_images_are_refused():
-    assert cropped_images(close_loop_images(142), 128)[keys.PIXELS].size == 128
+    assert cropped_images(close_loop_images(142), 128)[keys.DEPTH].size == 128
     for size in (64, 128):  # all crops of 128 of 128 px would be the same
-        with pytest.raises(ConfigError, match=rf"crop_size=128: image 'pixels' has only {size} px"):
+        with pytest.raises(ConfigError, match=rf"crop_size=128: image 'depth' has only {size} px"):
             cropped_images(close_loop_images(size), 128)
 
 
 def test_a_seed_determines_the_offsets_and_a_state_continues_them():
     first, second, data = views(padding=2), views(padding=2), batch()
-    assert torch.equal(first(data)[keys.PIXELS], second(data)[keys.PIXELS])
+    assert torch.equal(first(data)[keys.DEPTH], second(data)[keys.DEPTH])
     first(data)
     second.load_state_dict(first.state_dict())
-    assert torch.equal(first(data)[keys.PIXELS], second(data)[keys.PIXELS])
-    assert not torch.equal(first(data)[keys.PIXELS], first(data)[keys.PIXELS])
+    assert torch.equal(first(data)[keys.DEPTH], second(data)[keys.DEPTH])
+    assert not torch.equal(first(data)[keys.DEPTH], first(data)[keys.DEPTH])
     with pytest.raises(ValueError, match="views must be positive"):
         views(views=0)

@@ -25,7 +25,7 @@ QUANTIZER = DepthQuantizer(0.32)
 
 def buffer(capacity=50, batch_size=8, seed=0, kind="prioritized", **settings):
     return make_replay(
-        kind, capacity, batch_size, codecs={keys.PIXELS: QUANTIZER}, seed=seed, **settings
+        kind, capacity, batch_size, codecs={keys.DEPTH: QUANTIZER}, seed=seed, **settings
     )
 
 
@@ -36,12 +36,12 @@ def episode(length, rng, size=8, expert=False, truncated=False):
     last = torch.arange(length)[:, None] == length - 1
     return TensorDict(
         {
-            keys.PIXELS: frames[:-1],
+            keys.DEPTH: frames[:-1],
             keys.HOLDING: holding[:-1],
             keys.ACTION: torch.from_numpy(rng.random((length, 5), dtype=np.float32)),
             keys.IS_DEMONSTRATION: torch.full((length, 1), expert),
             keys.NEXT: {
-                keys.PIXELS: frames[1:],
+                keys.DEPTH: frames[1:],
                 keys.HOLDING: holding[1:],
                 keys.REWARD: last.float(),
                 keys.TERMINATED: last & (not truncated),
@@ -55,7 +55,7 @@ def episode(length, rng, size=8, expert=False, truncated=False):
 
 
 def assert_same(stored, original):
-    for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
+    for key in (keys.DEPTH, (keys.NEXT, keys.DEPTH)):
         assert stored[key].dtype == torch.float32
         assert (stored[key] - original[key]).abs().max() <= QUANTIZER.max_error_m * 1.001
     for key in (keys.HOLDING, keys.ACTION, keys.IS_DEMONSTRATION, (keys.NEXT, keys.TRUNCATED)):
@@ -66,7 +66,7 @@ def frames_needed(transitions):
     """Number of distinct frames of transitions, by their codes."""
     codes = set()
     for t in transitions:
-        for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
+        for key in (keys.DEPTH, (keys.NEXT, keys.DEPTH)):
             codes.add(QUANTIZER.encode(t[key]).numpy().tobytes())
     return len(codes)
 
@@ -79,7 +79,7 @@ def test_a_plain_episode_shares_its_frames():
     assert_same(rb[:], data)
     assert rb.storage.frame_count == 11
     one = rb.storage[3]
-    assert one[keys.PIXELS].shape == (1, 8, 8)
+    assert one[keys.DEPTH].shape == (1, 8, 8)
     assert_same(one[None], data[3:4])
 
 
@@ -200,16 +200,16 @@ def test_incompressible_images_fit_as_well():
 def test_memory_of_expert_episodes(task):
     """100,000 transitions of 128 px take 0.5 GB at most, also with short episodes."""
     env = ba_torchrl.make_vector_env(task, 1, parallel=False, seed=0, expert=True)
-    pixels = env.observation_spec[keys.PIXELS]
-    quantizer = DepthQuantizer(float(pixels.space.high.max()))
+    depth = env.observation_spec[keys.DEPTH]
+    quantizer = DepthQuantizer(float(depth.space.high.max()))
     episodes = collect_demonstrations(env, 3, seed=0)
     env.close()
-    rb = make_replay("uniform", 200, 8, codecs={keys.PIXELS: quantizer}, seed=0)
+    rb = make_replay("uniform", 200, 8, codecs={keys.DEPTH: quantizer}, seed=0)
     for data in episodes:
-        rb.extend(as_transitions(data, ["pixels"], is_demonstration=True))
+        rb.extend(as_transitions(data, ["depth"], is_demonstration=True))
     assert rb.storage.nbytes / len(rb) <= 5_000
     original = torch.cat(episodes)
-    for key in (keys.PIXELS, (keys.NEXT, keys.PIXELS)):
+    for key in (keys.DEPTH, (keys.NEXT, keys.DEPTH)):
         assert torch.equal(rb[:][key], quantizer(original[key]))
 
 
@@ -236,7 +236,7 @@ def test_overwriting_reuses_frames():
     for _ in range(50):
         rb.extend(episode(5, rng))
     assert rb.storage.frame_count == 24
-    assert rb.storage._frames[keys.PIXELS].nbytes < 30 * (100 + 64 + 60)  # slots are used again
+    assert rb.storage._frames[keys.DEPTH].nbytes < 30 * (100 + 64 + 60)  # slots are used again
 
 
 @pytest.mark.parametrize("kind", ["uniform", "prioritized", "symmetric"])
@@ -255,7 +255,7 @@ def test_samples_are_float_metres_with_an_index(kind):
     again = buffer(kind=kind)
     again.extend(data)
     assert torch.equal(again.sample()["index"], sample["index"])
-    sample[keys.PIXELS].zero_()  # a sample is a copy
+    sample[keys.DEPTH].zero_()  # a sample is a copy
     assert_same(rb[:], data)
 
 
@@ -291,7 +291,7 @@ def test_transitions_with_another_schema_are_refused():
     missing = data.exclude(keys.HOLDING)
     extra = data.clone().set("colour", torch.zeros(4))
     other_type = data.clone().set(keys.ACTION, data[keys.ACTION].double())
-    other_shape = data.clone().set(keys.PIXELS, torch.zeros(4, 1, 9, 9))
+    other_shape = data.clone().set(keys.DEPTH, torch.zeros(4, 1, 9, 9))
     for bad, words in [
         (missing, "missing 'holding'"),
         (extra, "unexpected 'colour'"),
@@ -304,7 +304,7 @@ def test_transitions_with_another_schema_are_refused():
     assert len(rb) == 4
     assert_same(rb[:], data)
     with pytest.raises(ReplaySchemaError, match="lack"):
-        buffer().extend(data.exclude(keys.PIXELS))
+        buffer().extend(data.exclude(keys.DEPTH))
     rb.extend(data.exclude((keys.NEXT, keys.FAULT)))  # the flag is not part of what is stored
 
 

@@ -20,13 +20,13 @@ def transitions(numbers, is_demonstration):
     flag = torch.zeros(count, 1, dtype=torch.bool)
     return TensorDict(
         {
-            "pixels": image(0.0, 8),
+            "heightmap": image(0.0, 8),
             "in_hand": image(0.01, 4),
             "holding": flag,
             "action": value[:, None],
             "is_demonstration": flag | is_demonstration,
             "next": {
-                "pixels": image(0.02, 8),
+                "heightmap": image(0.02, 8),
                 "in_hand": image(0.03, 4),
                 "holding": flag,
                 "reward": torch.zeros(count, 1),
@@ -41,7 +41,7 @@ def transitions(numbers, is_demonstration):
 
 
 def replay(capacity=100, batch_size=8, seed=0):
-    codecs = {"pixels": CODEC, "in_hand": CODEC}
+    codecs = {"heightmap": CODEC, "in_hand": CODEC}
     return make_replay("symmetric", capacity, batch_size, codecs=codecs, seed=seed)
 
 
@@ -107,9 +107,9 @@ def test_images_are_restored_within_the_error_of_the_codec():
     made = filled()
     batch = made.sample()
     for key, offset in [
-        ("pixels", 0.0),
+        ("heightmap", 0.0),
         ("in_hand", 0.01),
-        (("next", "pixels"), 0.02),
+        (("next", "heightmap"), 0.02),
         (("next", "in_hand"), 0.03),
     ]:
         expected = batch["action"].reshape(-1, 1, 1, 1) / 1024 + offset

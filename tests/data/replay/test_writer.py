@@ -15,20 +15,20 @@ QUANTIZER = DepthQuantizer(0.4)
 def transitions(numbers, is_demonstration):
     """Transitions whose action is their number."""
     count = len(numbers)
-    pixels = torch.zeros(count, 1, 4, 4)
+    depth = torch.zeros(count, 1, 4, 4)
     return TensorDict(
         {
-            keys.PIXELS: pixels,
+            keys.DEPTH: depth,
             keys.ACTION: torch.tensor(list(numbers), dtype=torch.float32)[:, None],
             keys.IS_DEMONSTRATION: torch.full((count, 1), is_demonstration),
-            keys.NEXT: {keys.PIXELS: pixels.clone()},
+            keys.NEXT: {keys.DEPTH: depth.clone()},
         },
         batch_size=[count],
     )
 
 
 def replay(capacity=64, kind="uniform"):
-    return make_replay(kind, capacity, 8, codecs={keys.PIXELS: QUANTIZER}, seed=0)
+    return make_replay(kind, capacity, 8, codecs={keys.DEPTH: QUANTIZER}, seed=0)
 
 
 def numbers_in(made):

@@ -52,7 +52,7 @@ class TestFailures:
         assert state["step_count"].flatten().tolist() == [2, 2, 0]
         assert not state["done"].any()
         assert not state["fault"].any()
-        assert not torch.equal(state["pixels"][2], before["pixels"][2])
+        assert not torch.equal(state["depth"][2], before["depth"][2])
         result, state = env.step_and_maybe_reset(act(env, state))
         assert state["step_count"].flatten().tolist() == [3, 3, 1]
         assert env.restarts == 1
@@ -60,11 +60,11 @@ class TestFailures:
     @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
     def test_in_a_reset_are_retried(self, make_fakes, tmp_path, order):
         env = make_fakes(2, folder=tmp_path, timeout_s=1.0)
-        expected = env.reset(seed=3)["pixels"]
+        expected = env.reset(seed=3)["depth"]
         (tmp_path / f"{env.worker_pids[0]}.reset").write_text(order)
         state = env.reset(seed=3)
         assert env.restarts == 1
-        assert torch.equal(state["pixels"], expected)  # a seed that was asked for is kept
+        assert torch.equal(state["depth"], expected)  # a seed that was asked for is kept
         assert not state["done"].any()
         assert_stepped(env.step(act(env, state.clone())), 0, state)
 
@@ -112,16 +112,16 @@ class TestFailures:
     def test_fresh_seeds_are_the_same_in_every_run(self, make_fakes, tmp_path):
         def run(seed):
             env = make_fakes(2, seed=seed)
-            first = env.reset()["pixels"][1]
-            pixels = [first]
+            first = env.reset()["depth"][1]
+            images = [first]
             for _ in range(2):
                 os.kill(env.worker_pids[1], signal.SIGKILL)
-                pixels.append(env.reset()["pixels"][1])
-            return torch.stack(pixels)
+                images.append(env.reset()["depth"][1])
+            return torch.stack(images)
 
-        pixels = run(4)
-        assert torch.equal(run(4), pixels)
-        assert len(torch.cat([pixels, run(5)]).unique(dim=0)) == 6
+        images = run(4)
+        assert torch.equal(run(4), images)
+        assert len(torch.cat([images, run(5)]).unique(dim=0)) == 6
 
     def test_without_end_raise(self, make_fakes, tmp_path):
         env = make_fakes(2, folder=tmp_path, max_restarts=2)

@@ -167,5 +167,5 @@ def test_worker_options_are_an_object_or_keywords_of_make_vector_env():
     assert env.workers == WorkerOptions(start_method="fork", **expected)
     with pytest.raises(ConfigError, match=r"workers:\n  timeout_s: .* greater than 0"):
         ba_torchrl.make_vector_env("close_loop/block_reaching", 1, timeout_s=0)
-    assert isinstance(env.reset()["pixels"], torch.Tensor)
+    assert isinstance(env.reset()["depth"], torch.Tensor)
     env.close()

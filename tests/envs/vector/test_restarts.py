@@ -74,10 +74,10 @@ def test_environments_are_absent_while_their_worker_starts(make_fakes, tmp_path,
 
 def test_a_full_reset_waits_for_workers_that_start(make_fakes, tmp_path):
     env = make_fakes(2, wait_for_restarts=False)
-    expected = env.reset(seed=8)["pixels"]
+    expected = env.reset(seed=8)["depth"]
     kill(env.worker_pids[1])
     state = env.reset(seed=8)
-    assert torch.equal(state["pixels"], expected)
+    assert torch.equal(state["depth"], expected)
     assert not state["fault"].any()
     assert env.restarts == 1
 

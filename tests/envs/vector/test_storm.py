@@ -34,16 +34,16 @@ class SealedEnv(FakeEnv):
 
     def _observe(self, **flags):
         out = super()._observe(**flags)
-        out["pixels"][0, 0, 1] = os.getpid()
-        out["pixels"][0, 0, 0] = checksum(out)
+        out["depth"][0, 0, 1] = os.getpid()
+        out["depth"][0, 0, 0] = checksum(out)
         return out
 
 
 def checksum(transition):
-    """Return a checksum of the pixels, without their corner, and of the step count."""
-    pixels = transition["pixels"].clone()
-    pixels[0, 0, 0] = 0
-    data = pixels.numpy().tobytes() + transition["step_count"].numpy().tobytes()
+    """Return a checksum of the image, without its corner, and of the step count."""
+    depth = transition["depth"].clone()
+    depth[0, 0, 0] = 0
+    data = depth.numpy().tobytes() + transition["step_count"].numpy().tobytes()
     return zlib.crc32(data) % 2**20  # exact in float32
 
 
@@ -85,10 +85,10 @@ def collect(steps, seconds, seen):
                 faults += not transition["fault"]  # else its worker starts
                 continue
             for part in (transition, following):  # not torn
-                assert part["pixels"][0, 0, 0] == checksum(part)
+                assert part["depth"][0, 0, 0] == checksum(part)
             assert following["step_count"] == transition["step_count"] + 1
             assert following["reward"].item() == pytest.approx(transition["action"].sum().item())
-            name = following["pixels"].numpy().tobytes()
+            name = following["depth"].numpy().tobytes()
             assert name not in seen  # not duplicated
             seen.add(name)
             frames += 1

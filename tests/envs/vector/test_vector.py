@@ -23,18 +23,18 @@ SMALL = {"start_method": "fork", "obs_size": 16, "seed": 0}
 
 
 class TestSeeds:
-    def pixels(self, env, **kwargs):
-        first = env.reset(**kwargs)["pixels"]
+    def images(self, env, **kwargs):
+        first = env.reset(**kwargs)["depth"]
         rollout = env.rollout(3, auto_reset=True, break_when_any_done=False)
-        return torch.cat([first[:, None], rollout["pixels"]], 1)
+        return torch.cat([first[:, None], rollout["depth"]], 1)
 
     def test_serial_and_parallel_agree(self, make_fakes):
         serial = make_fakes(3, seed=5, parallel=False)
         parallel = make_fakes(3, seed=5)
-        expected = self.pixels(serial)
-        assert torch.equal(self.pixels(parallel), expected)
+        expected = self.images(serial)
+        assert torch.equal(self.images(parallel), expected)
         assert len(expected[:, 0].unique(dim=0)) == 3
-        assert torch.equal(self.pixels(serial, seed=40), self.pixels(parallel, seed=40))
+        assert torch.equal(self.images(serial, seed=40), self.images(parallel, seed=40))
 
     @pytest.mark.parametrize("parallel", [False, True])
     @pytest.mark.parametrize("static", [False, True])
@@ -42,9 +42,9 @@ class TestSeeds:
         env = make_fakes(3, parallel=parallel)
         reference = SerialEnv(3, FakeEnv)
         assert env.set_seed(8, static) == reference.set_seed(8, static_seed=static)
-        pixels = env.reset()["pixels"]
-        assert torch.equal(pixels, reference.reset()["pixels"])
-        assert len(pixels.unique(dim=0)) == (1 if static else 3)
+        images = env.reset()["depth"]
+        assert torch.equal(images, reference.reset()["depth"])
+        assert len(images.unique(dim=0)) == (1 if static else 3)
 
     @pytest.mark.parametrize("parallel", [False, True])
     def test_none_is_a_random_one(self, parallel):
@@ -53,7 +53,7 @@ class TestSeeds:
             seen = []
             for _ in range(2):
                 assert env.set_seed(None) is None
-                seen.append(env.reset()["pixels"])
+                seen.append(env.reset()["depth"])
             assert len(torch.cat(seen).unique(dim=0)) == 4
         finally:
             env.close()
@@ -61,10 +61,10 @@ class TestSeeds:
     @pytest.mark.parametrize("parallel", [False, True])
     def test_environment_i_has_seed_plus_i(self, make_fakes, parallel):
         env = make_fakes(3, seed=5, parallel=parallel)
-        at_start = env.reset()["pixels"]
-        again = env.reset(seed=6)["pixels"]
+        at_start = env.reset()["depth"]
+        again = env.reset(seed=6)["depth"]
         assert torch.equal(again[:2], at_start[1:])
-        assert torch.equal(env.reset(seed=5)["pixels"], at_start)
+        assert torch.equal(env.reset(seed=5)["depth"], at_start)
 
     @pytest.mark.parametrize("parallel", [False, True])
     def test_refuses_invalid_seeds(self, make_fakes, parallel):
@@ -85,7 +85,7 @@ class TestResets:
         mask = torch.tensor([[False], [True], [False]])
         after = env.reset(state.clone().set("_reset", mask))
         assert after["step_count"].flatten().tolist() == [1, 0, 1]
-        same = (after["pixels"] == state["pixels"]).flatten(1).all(1)
+        same = (after["depth"] == state["depth"]).flatten(1).all(1)
         assert same.tolist() == [True, False, True]
 
     def test_of_none_changes_nothing(self, make_fakes):
@@ -93,7 +93,7 @@ class TestResets:
         state = env.step(act(env, env.reset()))["next"].exclude("reward")
         mask = torch.zeros(2, 1, dtype=torch.bool)
         after = env.reset(state.clone().set("_reset", mask))
-        assert torch.equal(after["pixels"], state["pixels"])
+        assert torch.equal(after["depth"], state["depth"])
         assert after["step_count"].flatten().tolist() == [1, 1]
 
     @pytest.mark.parametrize("options", [{"parallel": False}, {}])
@@ -205,7 +205,7 @@ class TestWithTheRestOfTorchRL:
         env = make_fakes(2, seed=3, start_method="spawn", timeout_s=60.0)
         expected = make_fakes(2, seed=3, parallel=False).reset()
         before = env.reset()
-        assert torch.equal(before["pixels"], expected["pixels"])
+        assert torch.equal(before["depth"], expected["depth"])
         os.kill(env.worker_pids[1], signal.SIGKILL)
         result, state = env.step_and_maybe_reset(act(env, before.clone()))
         assert_lost(result, 1, before)
@@ -215,10 +215,10 @@ class TestWithTheRestOfTorchRL:
     def test_observations_are_copies(self, make_fakes):
         env = make_fakes(2)
         state = env.reset()
-        kept = state["pixels"].clone()
+        kept = state["depth"].clone()
         env.step(act(env, state.clone()))
         env.reset()
-        assert torch.equal(state["pixels"], kept)
+        assert torch.equal(state["depth"], kept)
 
 
 class TestResources:

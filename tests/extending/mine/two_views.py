@@ -10,7 +10,7 @@ from ba_torchrl.modules.base import NETWORKS, ActorCritic
 
 
 class Features(nn.Module):
-    """(pixels, wrist, holding) -> features [..., F], for any leading batch shape."""
+    """(depth, wrist, holding) -> features [..., F], for any leading batch shape."""
 
     def __init__(self, width):
         super().__init__()
@@ -20,18 +20,18 @@ class Features(nn.Module):
         )
         self.size = 2 * 16 * width + 1
 
-    def forward(self, pixels, wrist, holding):
+    def forward(self, depth, wrist, holding):
         """Return the features of both views, and the holding flag."""
-        batch = pixels.shape[:-3]
+        batch = depth.shape[:-3]
         seen = [
             view(image.flatten(0, -4) if batch else image[None]).reshape(*batch, -1)
-            for view, image in zip(self.views, (pixels, wrist), strict=True)
+            for view, image in zip(self.views, (depth, wrist), strict=True)
         ]
         return torch.cat([*seen, holding.float()], dim=-1)
 
 
 class Actor(nn.Module):
-    """(pixels, wrist, holding) -> mean and scale [..., A]."""
+    """(depth, wrist, holding) -> mean and scale [..., A]."""
 
     def __init__(self, width, action_size):
         super().__init__()
@@ -63,7 +63,7 @@ class TwoViewsConfig(StrictModel):
     """Hyper-parameters of the network."""
 
     control: ClassVar[str] = "close_loop"
-    image_keys: ClassVar[tuple[str, ...]] = ("pixels", "wrist")
+    image_keys: ClassVar[tuple[str, ...]] = ("depth", "wrist")
     vector_keys: ClassVar[tuple[str, ...]] = ()
     width: int = 4
 

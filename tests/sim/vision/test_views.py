@@ -96,7 +96,7 @@ def test_environments_observe_the_default_view(task):
     ours = VIEWS[env.config.view_type].image(
         ViewInput(setup, scene.world, scene.camera, robot.tool_pose(), robot.opening())
     )
-    np.testing.assert_array_equal(ours.astype(np.float32), state[keys.PIXELS].numpy())
+    np.testing.assert_array_equal(ours.astype(np.float32), state[keys.DEPTH].numpy())
     env.close()
 
 

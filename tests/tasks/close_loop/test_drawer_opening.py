@@ -300,7 +300,7 @@ def test_episodes_repeat_in_a_used_and_in_a_fresh_world(make):
             if len(seen) % 4 == 3:
                 action = torch.from_numpy(rng.uniform(-1, 1, 5).astype(np.float32))
             state = env.step(state.set("action", action))["next"]
-            seen.append(state["pixels"].clone())
+            seen.append(state["depth"].clone())
         scene = env.scene
         return torch.stack(seen), scene.task.cabinet.travel_m, scene.robot.measured_joints()
 

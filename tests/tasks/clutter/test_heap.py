@@ -259,7 +259,7 @@ def test_a_state_restores_the_heap_and_the_failures(make, control):
     play(env, env.reset(), NO_OPS[control])
     state = env.reset()
     kept, present, before = env.get_state(), names(env), digest(env)
-    pixels, action = state["pixels"].clone(), state["expert_action"].clone()
+    depth, action = state["depth"].clone(), state["expert_action"].clone()
     assert len(present) == DEFAULT_COUNT[control] - 1
     for _ in range(4):
         play(env, env.reset())
@@ -267,7 +267,7 @@ def test_a_state_restores_the_heap_and_the_failures(make, control):
     state = env.set_state(kept)
     assert names(env) == present
     assert digest(env) == before
-    assert torch.equal(state["pixels"], pixels)
+    assert torch.equal(state["depth"], depth)
     assert torch.equal(state["expert_action"], action)
     assert env.scene.task.failures == 1
     shown = [body.name for body in env.scene.task.pool.bodies if not body.is_hidden]

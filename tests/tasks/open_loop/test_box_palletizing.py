@@ -151,9 +151,9 @@ def test_inactive_boxes_are_hidden_and_do_not_delay_settling(make_env):
     state = env.reset()
     task = env.scene.task
     present = task.objects[0]
-    pixels = state["pixels"][0].numpy()
-    assert 0.04 < pixels.max() < 0.05
-    area = (pixels > 0.04).sum() * (0.4 / 128) ** 2
+    heightmap = state["heightmap"][0].numpy()
+    assert 0.04 < heightmap.max() < 0.05
+    area = (heightmap > 0.04).sum() * (0.4 / 128) ** 2
     assert area == pytest.approx(BOX_M[0] * BOX_M[1], rel=0.15)
     assert env.scene.world.settle(10)
     assert all(body.is_hidden for body in task.pool.bodies if body is not present)

@@ -65,7 +65,7 @@ def assert_each_transition_once(batches):
             before = steps.setdefault(trajectory, [])
             assert int(step["step_count"]) == len(before)
             if before:
-                assert torch.equal(step[keys.PIXELS], before[-1][keys.NEXT, keys.PIXELS])
+                assert torch.equal(step[keys.DEPTH], before[-1][keys.NEXT, keys.DEPTH])
                 assert not before[-1][keys.NEXT, keys.DONE]
             before.append(step)
     assert len(steps) > 1

@@ -81,8 +81,8 @@ def test_workers_start_the_episodes_of_the_default_collector(collecting):
     single, _ = collecting("single")
     sync, _ = collecting("multi_sync")
     expected, found = next(single), next(sync)
-    assert len(found[keys.PIXELS].flatten(1).unique(dim=0)) == 4
-    assert torch.equal(found[keys.PIXELS], expected[keys.PIXELS])
+    assert len(found[keys.DEPTH].flatten(1).unique(dim=0)) == 4
+    assert torch.equal(found[keys.DEPTH], expected[keys.DEPTH])
 
 
 def test_several_steps_per_batch(tmp_path):
@@ -119,8 +119,8 @@ def test_ended_workers_are_replaced_with_the_present_weights(kind, collecting):
     new = [after[-1], *(next(collection) for _ in range(4))]
     assert torch.allclose(new[0][keys.ACTION], own_actions(algorithm, new[0]), atol=1e-6)
     assert_each_transition_once(new)
-    first = torch.cat([batch[keys.PIXELS] for batch in before])
-    assert not (new[0][keys.PIXELS][:, None] == first[None]).flatten(2).all(2).any()
+    first = torch.cat([batch[keys.DEPTH] for batch in before])
+    assert not (new[0][keys.DEPTH][:, None] == first[None]).flatten(2).all(2).any()
 
 
 @pytest.mark.parametrize("kind", KINDS)

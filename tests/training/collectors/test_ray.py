@@ -44,7 +44,7 @@ def test_collection_goes_on_when_a_node_fails(tmp_path):
         assert collection.scalars["lag"] == 0
         assert torch.allclose(newest[keys.ACTION], own_actions(algorithm, newest), atol=1e-6)
         data = torch.cat(batches)
-        rows = torch.cat([data[keys.PIXELS].flatten(1), data[keys.ACTION]], dim=1)
+        rows = torch.cat([data[keys.DEPTH].flatten(1), data[keys.ACTION]], dim=1)
         assert len(rows.unique(dim=0)) == len(rows) == 2 * len(batches)
 
         worker = collection._collector.remote_collectors[0]
