@@ -44,7 +44,7 @@ def test_all_observations_together_follow_their_specs(make):
     env = make("open_loop/house_building_2", *names, rgb=True, camera_size=40)
     check_env_specs(env)
     state = env.reset()
-    assert state["depth"].shape == (1, 32, 32)
+    assert state["heightmap"].shape == (1, 32, 32)
     assert state["rgb"].shape == state["wrist_rgb"].shape == (3, 40, 40)
     assert state["rgb_depth"].shape == state["segmentation"].shape == (1, 40, 40)
     assert env.vectors == {"proprio": 8, "joints": 7}

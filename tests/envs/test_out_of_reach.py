@@ -22,7 +22,7 @@ def test_a_pick_through_the_floor_has_no_effect_and_is_told(fast_mode):
     assert env.is_out_of_reach is False
     after = env.step(state.clone().set(keys.ACTION, torch.tensor(HORIZONTAL)))[keys.NEXT]
     assert env.is_out_of_reach
-    torch.testing.assert_close(after[keys.DEPTH], state[keys.DEPTH], atol=1e-4, rtol=0)
+    torch.testing.assert_close(after[keys.HEIGHTMAP], state[keys.HEIGHTMAP], atol=1e-4, rtol=0)
     saved = env.get_state()
     env.step(state.clone().set(keys.ACTION, torch.tensor(VERTICAL)))
     assert not env.is_out_of_reach

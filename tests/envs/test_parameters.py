@@ -236,7 +236,7 @@ def test_environments_are_made_from_resolved_parameters(make):
     assert (env.config.obs_size, env.max_steps) == (32, 14)  # the default of eight blocks
     env.close()
     vector = ba_torchrl.make_vector_env(resolved, 2, parallel=False, max_steps=3)
-    assert vector.reset()["depth"].shape == (2, 1, 32, 32)
+    assert vector.reset()["heightmap"].shape == (2, 1, 32, 32)
     vector.close()
     named = resolve_env(PICKING, {}, modules=["json"])
     assert pickle.loads(pickle.dumps(named)).modules == named.changed(seed=1).modules == ("json",)
