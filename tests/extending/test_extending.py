@@ -101,7 +101,7 @@ def test_a_terrain_raises_what_stands_on_it(additions, started):
     height_m = additions["plateau"].HEIGHT_M
     bodies = env.scene.task.objects
     assert [body.position[2] for body in bodies] == pytest.approx([height_m + 0.015] * 3, abs=1e-3)
-    assert float(state[keys.DEPTH].min()) == pytest.approx(height_m, abs=1e-6)
+    assert float(state[keys.HEIGHTMAP].min()) == pytest.approx(height_m, abs=1e-6)
     # a pick below the slab is raised until the fingers close above it
     x, y, _ = bodies[0].position
     body = env.scene.controller.pick((x, y, 0.0), downward(0.0))
@@ -113,7 +113,7 @@ def test_the_random_parts_of_a_terrain_belong_to_the_episode_and_its_state(start
     terrain, heights = env.scene.task.terrain, []
     for _ in range(3):
         heights.append(terrain.height_m((0.0, 0.0)))
-        assert float(state[keys.DEPTH].min()) == pytest.approx(heights[-1], abs=1e-6)
+        assert float(state[keys.HEIGHTMAP].min()) == pytest.approx(heights[-1], abs=1e-6)
         kept, state = env.get_state(), env.reset()
     assert len(set(heights)) == 3
     env.set_state(kept)
