@@ -73,7 +73,7 @@ def shipped():
 @pytest.mark.parametrize(
     ("control", "changes", "message"),
     [
-        ("open_loop", {"obs_size": 128}, r"depth of shape \[1, 64, 64\], and this is \[1, 128"),
+        ("open_loop", {"obs_size": 128}, r"heightmap of shape \[1, 64, 64\], and this is \[1, 1"),
         ("open_loop", {"in_hand_size": 32}, r"in_hand of shape \[1, 24, 24\], and this is \[1, 32"),
         ("open_loop", {"action_sequence": "pyxr"}, "the environment takes .*'pyxr'"),
         ("open_loop", {"half_rotation": False}, "the environment takes .*half_rotation=False"),

@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.meshes import box_mesh, write_obj
 from ba_torchrl.tasks.clutter.base import DROP_Z_M
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
+from ba_torchrl.testing.episodes import image_of
 from tests.tasks.episodes import play
 
 NO_OPS = {
@@ -259,7 +260,7 @@ def test_a_state_restores_the_heap_and_the_failures(make, control):
     play(env, env.reset(), NO_OPS[control])
     state = env.reset()
     kept, present, before = env.get_state(), names(env), digest(env)
-    depth, action = state["depth"].clone(), state["expert_action"].clone()
+    image, action = image_of(state).clone(), state["expert_action"].clone()
     assert len(present) == DEFAULT_COUNT[control] - 1
     for _ in range(4):
         play(env, env.reset())
@@ -267,7 +268,7 @@ def test_a_state_restores_the_heap_and_the_failures(make, control):
     state = env.set_state(kept)
     assert names(env) == present
     assert digest(env) == before
-    assert torch.equal(state["depth"], depth)
+    assert torch.equal(image_of(state), image)
     assert torch.equal(state["expert_action"], action)
     assert env.scene.task.failures == 1
     shown = [body.name for body in env.scene.task.pool.bodies if not body.is_hidden]
