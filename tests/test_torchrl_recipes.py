@@ -83,7 +83,7 @@ def test_a_script_trains_and_evaluates_alike_with_the_same_seed(
         assert (~is_demonstration).sum() == 6  # three steps of two environments
         truncated = replay.storage.column((keys.NEXT, keys.TRUNCATED))
         online = truncated[~is_demonstration].tolist()
-        assert online == [False, name == "sacfd"] * 3  # of a batch, SACTrainer sets the last
+        assert online == [name == "sacfd"] * 6  # SACTrainer sets those of a batch's last steps
     if storage:
         loss = losses[0][0]
         loss.load_state_dict({key: value * 0 for key, value in loss.state_dict().items()})
