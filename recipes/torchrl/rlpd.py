@@ -36,10 +36,11 @@ def main(
     batch_size: int = 64,
     width: int = 8,
     critics: int = 2,
+    updates_per_step: int = 4,
     eval_every: int = 150,
     eval_episodes: int = 50,
 ) -> float:
-    """Train a policy with one update per step of all environments, and return its success rate."""
+    """Train a policy, and return its success rate."""
     torch.manual_seed(seed)
     make = partial(ba_torchrl.make_vector_env, task, num_envs, parallel=False, obs_size=64)
     single = ba_torchrl.make(task, obs_size=64, seed=seed + 10_000)
@@ -68,7 +69,7 @@ def main(
         deactivate_vmap=True,  # a loop is faster on a CPU
     )
     loss.make_value_estimator(gamma=0.95)
-    optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=1e-3)
     target_updater = SoftUpdate(loss, tau=0.05)
 
     offline = ReplayBuffer(storage=LazyTensorStorage(100 * demonstrations))
@@ -93,14 +94,15 @@ def main(
     )
     for step, data in enumerate(collector, start=1):
         replay.extend(as_transitions(data, images, is_demonstration=False))
-        losses = loss(replay.sample())
-        optimizer.zero_grad()
-        sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
-        optimizer.step()
-        target_updater.step()
+        for _ in range(updates_per_step):
+            losses = loss(replay.sample())
+            optimizer.zero_grad()
+            sum(value for key, value in losses.items() if key.startswith("loss_")).backward()
+            optimizer.step()
+            target_updater.step()
         if step % eval_every == 0 or step == steps:
             rate = evaluator.evaluate()["eval/reward"]
-            print(f"update {step}: success_rate {rate:.2f} over {eval_episodes} episodes")
+            print(f"step {step}: success_rate {rate:.2f} over {eval_episodes} episodes")
     collector.shutdown()
     evaluator.shutdown()
     return rate

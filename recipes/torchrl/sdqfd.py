@@ -30,7 +30,7 @@ from ba_torchrl.objectives import LevelDQNLoss
 def main(
     task: str = "open_loop/block_stacking",
     seed: int = 0,
-    updates: int = 1200,
+    updates: int = 600,
     num_objects: int = 3,
     demonstrations: int = 50,
     pretrain_updates: int = 300,
@@ -38,7 +38,7 @@ def main(
     batch_size: int = 16,
     width: float = 0.25,
     num_rotations: int = 8,
-    eval_every: int = 300,
+    eval_every: int = 150,
     eval_episodes: int = 50,
 ) -> float:
     """Train a policy, first on the demonstrations alone, and return its success rate."""
@@ -112,5 +112,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="open_loop/block_stacking")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--updates", type=int, default=1200)
+    parser.add_argument("--updates", type=int, default=600)
     main(**vars(parser.parse_args()))
