@@ -9,7 +9,7 @@ from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 from torchrl.envs import Compose, ParallelEnv, RewardScaling, StepCounter, TransformedEnv
 
 import ba_torchrl
-from ba_torchrl import data, modules, objectives
+from ba_torchrl import data, envs, modules, objectives
 from ba_torchrl.errors import install_command
 
 REACH = "close_loop/block_reaching"
@@ -22,7 +22,7 @@ def test_the_help_of_the_package_shows_its_functions():
         assert getattr(ba_torchrl, name).__doc__.strip().splitlines()[0] in text
 
 
-@pytest.mark.parametrize("package", [ba_torchrl, data, modules, objectives])
+@pytest.mark.parametrize("package", [ba_torchrl, data, envs, modules, objectives])
 def test_every_public_name_is_described(package):
     for name in set(package.__all__) - {"__version__", "NETWORKS"}:
         assert (getattr(package, name).__doc__ or "").strip(), name

@@ -30,14 +30,14 @@ from ba_torchrl.modules import (
 def main(
     task: str = "close_loop/block_reaching",
     seed: int = 0,
-    steps: int = 600,
+    steps: int = 300,
     demonstrations: int = 50,
     num_envs: int = 5,
     batch_size: int = 64,
     width: int = 8,
     critics: int = 2,
     updates_per_step: int = 4,
-    eval_every: int = 150,
+    eval_every: int = 100,
     eval_episodes: int = 50,
 ) -> float:
     """Train a policy, and return its success rate."""
@@ -112,5 +112,5 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--task", default="close_loop/block_reaching")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--steps", type=int, default=600)
+    parser.add_argument("--steps", type=int, default=300)
     main(**vars(parser.parse_args()))
