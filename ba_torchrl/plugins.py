@@ -91,8 +91,10 @@ def import_modules(names: Iterable[str]) -> None:
                     f"cannot import the plugin {name!r}: {_summary(error)}"
                 ) from error
             raise ConfigError(
-                f"cannot import the plugin {name!r}: there is no module {missing!r}. Run from "
-                "the folder that holds it, put that folder on PYTHONPATH, or install the package"
+                f"cannot import the plugin {name!r}: there is no module {missing!r}. "
+                + ("Leave out '.py', run" if name.endswith(".py") else "Run")
+                + " from the folder that holds it, put that folder on PYTHONPATH, or install the "
+                "package"
             ) from None
 
 

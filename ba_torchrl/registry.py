@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
-from ba_torchrl.errors import UnknownNameError, known_names
+from ba_torchrl.errors import ConfigError, UnknownNameError, known_names
 from ba_torchrl.plugins import load_entry_points
 
 T = TypeVar("T")
@@ -54,14 +54,19 @@ class Registry(Generic[T]):
         new definition replaces the old one.
 
         Raises:
-            ValueError: another object already has that name.
+            ConfigError: another object already has that name.
         """
         module = sys._getframe(1).f_globals.get("__name__", "__main__")
 
         def decorate(entry: T) -> T:
             known = self._entries.get(name, entry)
             if known is not entry and not _is_redefinition(known, entry):
-                raise ValueError(f"two {self.kind}s are named {name!r}: {known!r} and {entry!r}")
+                modules = {self._modules[name], module}
+                foreign = sorted(each for each in modules if each.partition(".")[0] != PACKAGE)
+                raise ConfigError(
+                    f"two {self.kind}s are named {name!r}: {known!r} and {entry!r}. Choose another "
+                    f"name in {' or '.join(foreign) or module}"
+                )
             self._entries[name] = entry
             self._modules[name] = module
             for listener in _LISTENERS.get(self.kind, ()):

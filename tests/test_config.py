@@ -117,7 +117,7 @@ def test_workspaces_out_of_reach_or_too_small_are_refused():
 def test_registry_refuses_two_entries_of_one_name():
     registry: Registry[object] = Registry("thing", "ba_torchrl.tasks.close_loop")
     registry.register("a")(1)
-    with pytest.raises(ValueError, match="two things are named 'a'"):
+    with pytest.raises(ConfigError, match=r"two things are named 'a'.*another name in tests\."):
         registry.register("a")(2)
     with pytest.raises(UnknownNameError, match="unknown thing 'b'"):
         registry["b"]

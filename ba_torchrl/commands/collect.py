@@ -32,7 +32,7 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.config import Source, changed
 from ba_torchrl.data.files import complete_only
-from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.envs.settings import check_env, resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.tasks.structures.base import check_has_structure
@@ -147,6 +147,8 @@ def _collect_graded(settings: Settings) -> None:
 
 def _collect(settings: Settings) -> None:
     """Play the expert's episodes, or deconstruct structures."""
+    (task,) = settings.task
+    check_env(task, settings.env)  # before the import of torch
     from ba_torchrl import make_vector_env
     from ba_torchrl.data.demo_files import save_demonstrations
     from ba_torchrl.data.demos import (
@@ -158,7 +160,6 @@ def _collect(settings: Settings) -> None:
     from ba_torchrl.data.episodes import mean_length, success_rate
     from ba_torchrl.data.time_reversal import replay_scores
 
-    (task,) = settings.task
     path = settings.folder
     actions = resolve_env(task, settings.env).actions
     check_noise(settings.noise, settings.source, "noise")

@@ -66,7 +66,7 @@ def main() -> None:
         print(f"{finding.name:22} {finding.state}", flush=True)
         if finding.fix:
             print(f"{'':22}   -> {finding.fix}")
-        is_complete = is_complete and finding.state != "missing"
+        is_complete = is_complete and not finding.state.startswith(("missing", "not known"))
     if not is_complete:
         sys.exit(1)
 
@@ -88,9 +88,9 @@ def find() -> Iterator[Finding]:
         try:
             yield check()
         except ModuleNotFoundError as error:
-            if (error.name or "").split(".")[0] not in NEEDED:
-                raise
             yield Finding(check.__name__.strip("_"), f"not known without {error.name}")
+        except (ImportError, OSError) as error:  # of a package that is damaged
+            yield Finding(check.__name__.strip("_"), f"not known: {' '.join(str(error).split())}")
 
 
 def _version(name: str) -> str | None:

@@ -24,7 +24,7 @@ from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NewPath, TaskId, Text, VideoFile
 from ba_torchrl.data.files import complete_only
-from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
+from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
 
@@ -56,6 +56,8 @@ class Settings(EnvSettings):
 
 def main(settings: Settings) -> None:
     """Play episodes and write a video of them, or demonstrations."""
+    if settings.task is not None and settings.policy in ("expert", "random"):
+        check_env(settings.task, settings.env)  # before the import of torch
     import torch
 
     from ba_torchrl.training.evaluation import record_episodes

@@ -15,6 +15,7 @@ from pydantic import Field
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text
+from ba_torchrl.envs.settings import check_env
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
@@ -54,6 +55,8 @@ class Settings(EnvSettings):
 
 def main(settings: Settings) -> None:
     """Print a table, row by row."""
+    for task in settings.tasks:
+        check_env(task, settings.env)  # before the import of torch
     from ba_torchrl.training.duration import compute_path
 
     learners = {task: list(learners_of(task, settings)) for task in settings.tasks}

@@ -63,6 +63,7 @@ REFUSED = [
     ("collect", "path=held", "writes held; choose another path"),
     ("collect", "task=close_loop/block_pulling", "demos/close_loop_block_pulling exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
+    ("collect", "plugins=[json.py]", "there is no module 'json.py'. Leave out '.py', run from"),
     ("play", "env.seed=5", "leave it out, and set seed"),
     ("play", "env.expert=true", "leave it out, and set policy"),
     ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),

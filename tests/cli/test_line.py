@@ -52,6 +52,7 @@ WITHOUT_TORCH = [
     ["tasks"],
     *([name, "seed=a"] for name in ("collect", "evaluate", "experts", "export", "play", "speed")),
     ["report", "run=a"],
+    *([name, "close_loop/block_picking", "env.scale=3"] for name in ("collect", "play", "speed")),
 ]
 """Command lines that are answered without the import of torch, which takes seconds."""
 
@@ -267,6 +268,20 @@ def test_doctor_goes_on_without_torch(capsys, monkeypatch):
     assert "torch                  missing\n" in out
     assert "gpu                    not known without torch\n" in out
     assert "shared memory          " in out
+
+
+def test_doctor_goes_on_with_a_package_that_is_damaged(capsys, monkeypatch):
+    from ba_torchrl.commands import doctor
+
+    def damaged():
+        raise OSError("libcudart.so: cannot open\nshared object file")
+
+    monkeypatch.setattr(doctor, "_gpu", damaged)
+    monkeypatch.setattr(doctor, "_version", lambda name: "1")
+    with pytest.raises(SystemExit) as end:
+        doctor.COMMAND.run([])
+    assert end.value.code == 1
+    assert ": libcudart.so: cannot open shared object file\n" in capsys.readouterr().out
 
 
 @pytest.mark.slow
