@@ -76,6 +76,10 @@ class Task(ABC):
         terrain: support surface of the objects; made by `make_terrain` if None.
     """
 
+    version: ClassVar[int] = 0
+    """Rises when episodes, observations or success change."""
+    expert_version: ClassVar[int] = 0
+    """Rises when the actions of the expert change."""
     control: ClassVar[Literal["open_loop", "close_loop"]]
     max_steps: ClassVar[int]
     """Default number of steps after which an episode is truncated."""
