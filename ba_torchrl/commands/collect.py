@@ -60,7 +60,7 @@ class Settings(VectorSettings, EnvSettings):
     replays: int = Field(default=0, ge=0)
     """Deconstruction: number of episodes whose reversal is checked in the simulator."""
     only_successful: bool = True
-    """Leave out failed episodes."""
+    """Play others in place of failed episodes."""
     noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random action in each step; the expert's is stored beside it."""
     turn_noise: float = Field(default=0.0, ge=0, lt=1)
@@ -157,7 +157,7 @@ def _collect(settings: Settings) -> None:
         collect_demonstrations,
         source_config,
     )
-    from ba_torchrl.data.episodes import mean_length, success_rate
+    from ba_torchrl.data.episodes import is_success, mean_length, success_rate
     from ba_torchrl.data.time_reversal import replay_scores
 
     path = settings.folder
@@ -186,12 +186,12 @@ def _collect(settings: Settings) -> None:
                     turn_noise=settings.turn_noise,
                     turns=actions.turns,
                     primitive=actions.primitive,
-                    on_episode=lambda _: bar.update(),
+                    on_episode=lambda episode: bar.update(
+                        is_success(episode) or not settings.only_successful
+                    ),
                 )
         finally:
             env.close()
-        if not episodes:
-            raise ConfigError(f"none of {settings.episodes} episodes of {task} can be used")
         save_demonstrations(
             scratch,
             episodes,

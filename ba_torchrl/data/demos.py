@@ -46,7 +46,7 @@ def collect_demonstrations(
 
     Args:
         env: a vector of environments made with `source_config`.
-        episodes: number of episodes to play.
+        episodes: their number. Episodes that are dropped are replaced by others.
         seed: of the first episodes; environment i starts from ``seed + i``.
         source: "expert", or "deconstruction" for episodes reversed in time. Episodes that cannot be
             reversed are dropped; all others succeed.
@@ -60,7 +60,7 @@ def collect_demonstrations(
             `env.actions.primitive`.
         nearest_action: maps the expert's and the random actions to those that are executed and
             recorded. A policy with discrete actions needs it; None for the identity.
-        on_episode: called with each episode when it ends, for progress bars.
+        on_episode: called with each episode that is played when it ends, for progress bars.
 
     Returns:
         Episodes as TensorDicts [T], with the entries of an environment without ``expert``. With
@@ -68,8 +68,8 @@ def collect_demonstrations(
         and ``expert_action`` [T, A] is the expert's in every state.
 
     Raises:
-        ConfigError: the source is unknown or cannot have noise, the noise is no probability, or
-            the action has no turns.
+        ConfigError: the source is unknown or cannot have noise, the noise is no probability, the
+            action has no turns, or too few episodes succeed.
     """
     if source not in SOURCES:
         raise ConfigError(f"source: {source!r} is not one of {', '.join(SOURCES)}")
@@ -95,15 +95,14 @@ def collect_demonstrations(
                 out.set(key, nearest_action(out[key]))
         return out
 
-    played = collect_episodes(env, policy, episodes, seed=seed, on_episode=on_episode)
+    keep = is_success if only_successful else None
     if source == "deconstruction":
-        return [reverse_episode(episode) for episode in played if is_reversible(episode)]
+        keep = is_reversible
+    played = collect_episodes(env, policy, episodes, seed=seed, on_episode=on_episode, keep=keep)
+    if source == "deconstruction":
+        return [reverse_episode(episode) for episode in played]
     same_action = () if add_noise is not None else (keys.EXPERT_ACTION,)
-    return [
-        episode.exclude(*same_action, (keys.NEXT, keys.EXPERT_ACTION))
-        for episode in played
-        if is_success(episode) or not only_successful
-    ]
+    return [episode.exclude(*same_action, (keys.NEXT, keys.EXPERT_ACTION)) for episode in played]
 
 
 class RandomActions:

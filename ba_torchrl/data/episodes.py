@@ -12,6 +12,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import check_policy
+from ba_torchrl.errors import ConfigError
 
 logger = logging.getLogger(__name__)
 
@@ -19,6 +20,8 @@ Policy = Callable[[TensorDictBase], TensorDictBase]
 
 RESULT_KEYS = (keys.REWARD, keys.SUCCESS, keys.FAULT, keys.TERMINATED, keys.TRUNCATED, keys.DONE)
 """Entries of a step that hold the result of an episode."""
+LEAST_KEPT = 0.1
+"""Least fraction of the episodes that must be kept."""
 
 
 def quotas(episodes: int, num_envs: int) -> list[int]:
@@ -35,12 +38,13 @@ def collect_episodes(
     seed: int | None = None,
     results_only: bool = False,
     on_episode: Callable[[TensorDict], None] | None = None,
+    keep: Callable[[TensorDict], bool] | None = None,
     max_lost: int = 100,
 ) -> list[TensorDict]:
     """Play complete episodes, a fixed number in each environment.
 
     The number is fixed because the first episodes to finish are biased towards short ones. An
-    episode with a fault is dropped, and the environment plays another one.
+    episode with a fault, or one that is not kept, is dropped, and the environment plays another.
 
     Args:
         env: a vector of environments, batch size [num_envs].
@@ -49,13 +53,15 @@ def collect_episodes(
         seed: of the first episodes; environment i starts from ``seed + i``.
         results_only: keep only the actions and the entries of `RESULT_KEYS`.
         on_episode: called with each episode when it ends, for progress bars.
-        max_lost: largest number of episodes that may be lost to faults.
+        keep: whether an episode counts; None if all do.
+        max_lost: largest number of episodes that may be lost to faults, and the number of dropped
+            ones from which `LEAST_KEPT` applies.
 
     Returns:
         Episodes as TensorDicts [T], in the order of the environments.
 
     Raises:
-        ConfigError: a trained policy is for another environment.
+        ConfigError: a trained policy is for another environment, or too few episodes are kept.
         RuntimeError: more than ``max_lost`` episodes were lost to faults.
     """
     check_policy(policy, env)
@@ -63,7 +69,7 @@ def collect_episodes(
     wanted = quotas(episodes, num_envs)
     finished: list[list[TensorDict]] = [[] for _ in wanted]
     current: list[list[TensorDict]] = [[] for _ in wanted]
-    lost = 0
+    lost = dropped = 0
     state = env.reset() if seed is None else env.reset(seed=seed)
     while any(len(done) < quota for done, quota in zip(finished, wanted, strict=True)):
         step, state = env.step_and_maybe_reset(policy(state))
@@ -85,9 +91,18 @@ def collect_episodes(
                     raise RuntimeError(f"{lost} episodes were lost to faults; see the log")
                 continue
             episode = torch.stack(steps)
-            finished[i].append(episode)
             if on_episode is not None:
                 on_episode(episode)
+            if keep is None or keep(episode):
+                finished[i].append(episode)
+                continue
+            dropped += 1
+            kept = sum(map(len, finished))
+            if dropped >= max_lost and kept < LEAST_KEPT * (kept + dropped):
+                raise ConfigError(
+                    f"only {kept} of {kept + dropped} episodes succeed, {episodes} are needed; "
+                    "take failed ones too, less noise or another source"
+                )
     return [episode for done in finished for episode in done]
 
 

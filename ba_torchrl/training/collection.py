@@ -96,8 +96,7 @@ def gather_demonstrations(
         on_episode: called with each episode that is played.
 
     Raises:
-        ConfigError: the folder holds none that can be used.
-        RuntimeError: no episode can be used.
+        ConfigError: too few episodes of the folder, or of those that are played, can be used.
     """
     if config.demonstrations_path is not None:
         episodes = load_demonstrations(
@@ -109,16 +108,18 @@ def gather_demonstrations(
         for name in ("demonstrations_noise", "demonstrations_turn_noise", "demonstrations_source"):
             if getattr(config, name) != type(config).model_fields[name].default:
                 logger.warning("%s has no effect on episodes of demonstrations_path", name)
-        episodes = episodes[: config.demonstrations]
         if config.only_successful_demonstrations:
             episodes = [episode for episode in episodes if is_success(episode)]
-        if not episodes:
-            raise ConfigError(f"no episode of {config.demonstrations_path} succeeds")
-        return episodes
+        if len(episodes) < config.demonstrations:
+            raise ConfigError(
+                f"{len(episodes)} episodes of {config.demonstrations_path} succeed, "
+                f"{config.demonstrations} are needed; set demonstrations to a smaller number"
+            )
+        return episodes[: config.demonstrations]
     seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
     env = make_env(config, seed, **source_config(config.demonstrations_source))
     try:
-        episodes = collect_demonstrations(
+        return collect_demonstrations(
             env,
             config.demonstrations,
             seed=seed,
@@ -133,9 +134,3 @@ def gather_demonstrations(
         )
     finally:
         env.close()
-    if not episodes:
-        raise RuntimeError(
-            f"no episode of the source {config.demonstrations_source!r} can be used; see "
-            "demonstrations_source and only_successful_demonstrations"
-        )
-    return episodes

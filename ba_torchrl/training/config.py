@@ -83,8 +83,8 @@ class ExperimentConfig(WorkerOptions):
     demonstrations_source: Source = "expert"
     """Their source: "expert", or "deconstruction" of structures, reversed in time."""
     only_successful_demonstrations: bool = False
-    """Leave out failed episodes; fewer remain where the expert fails. The reference implementation
-    keeps them in close loop and not in open loop."""
+    """Whether other episodes replace failed ones, as in the reference implementation in open loop;
+    in close loop it keeps failed ones."""
     demonstrations_noise: float = Field(default=0.0, ge=0, lt=1)
     """Probability of a random action in place of the expert's in each step of a demonstration that
     is played for the run (Laskey et al., 2017). The expert recovers. In these steps, the

@@ -14,7 +14,7 @@ from ba_torchrl.data.episodes import (
 )
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.errors import ConfigError, SimulationError
 
 TASK = "close_loop/block_reaching"
 
@@ -59,6 +59,24 @@ def test_episodes_are_whole_and_repeat_with_the_seed(expert_env):
         assert a["next", "done"].flatten().tolist() == [False] * (len(a) - 1) + [True]
         assert torch.equal(a["depth"][1:], a["next", "depth"][:-1])
     assert not torch.equal(first[0]["depth"][0], other[0]["depth"][0])
+
+
+def test_other_episodes_are_played_in_place_of_failed_ones(expert_env):
+    played = []
+    options = {"only_successful": True, "on_episode": played.append}
+    episodes = collect_demonstrations(expert_env, 6, seed=0, noise=0.9, **options)
+    assert len(episodes) == 6 < len(played)
+    assert success_rate(episodes) == 1.0
+    assert success_rate(played) == 6 / len(played)
+
+
+def test_an_expert_that_hardly_succeeds_is_refused():
+    env = ba_torchrl.make_vector_env(
+        TASK, 2, parallel=False, expert=True, obs_size=16, seed=0, max_steps=1
+    )
+    with pytest.raises(ConfigError, match="only 0 of 100 episodes succeed, 3 are needed; take"):
+        collect_demonstrations(env, 3, seed=0, only_successful=True)
+    env.close()
 
 
 def test_results_without_observations(expert_env):

@@ -245,7 +245,7 @@ def test_demonstrations_of_a_folder_are_filtered(tmp_path, caplog):
     algorithm = build_algorithm(good)
     assert len(gather_demonstrations(good, algorithm)) == 3
     assert "demonstrations_turn_noise has no effect" in caplog.text
-    with pytest.raises(ConfigError, match=r"no episode of .* succeeds"):
+    with pytest.raises(ConfigError, match=r"0 episodes of .* succeed, \d are needed"):
         gather_demonstrations(bad, algorithm)
 
 
