@@ -3,6 +3,7 @@
 import math
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
@@ -22,13 +23,15 @@ ROOT = Path(__file__).parents[3]
 CLOSE_LOOP_METHODS = {
     *(
         f"{algorithm} {net}"
-        for algorithm in ("sac", "sacfd", "sacfd_per")
+        for algorithm in ("sac", "sacfd", "sacfd_per", "sacfd_per_so2")
         for net in ("cnn", "equi")
     ),
     *(f"{kind}_{base} cnn" for kind in ("rad", "drq") for base in ("sac", "sacfd", "sacfd_per")),
     *(f"ferm_{base} ferm" for base in ("sac", "sacfd", "sacfd_per")),
 }
-"""Labels of the methods of figures 20 and 22."""
+"""Labels of the methods of figures 20 and 22, and of the reference's replay with rotated copies."""
+NEVER = 1_000_000
+"""Attempts that no run reaches."""
 
 
 def tasks_of(control):
@@ -72,6 +75,11 @@ def test_close_loop_benchmarks_have_the_appendix_or_reference_values(name, actio
         assert (env.action_sequence, env.random_orientation) == (actions, turned)
         pretraining, size = (1600, 142) if "ferm" in run.label else (0, 128)
         assert (env.robot, env.obs_size, run.num_envs) == ("kuka", size, 5)
+        low, high = np.transpose(env.workspace)
+        assert high - low == pytest.approx([0.3, 0.3, 0.24])
+        assert env.view_scale * 0.3 == pytest.approx(0.45)
+        assert getattr(env, "max_attempts", NEVER) == NEVER
+        assert run.network_config.precision == "float32"
         assert (run.demonstrations, run.pretrain_updates) == (100, pretraining)
         assert run.total_updates == 10_000 + pretraining
         assert (run.eval_every, run.eval_episodes) == (500, 100)
@@ -79,7 +87,10 @@ def test_close_loop_benchmarks_have_the_appendix_or_reference_values(name, actio
         assert (algorithm.batch_size, algorithm.buffer_size) == (64, 100_000)
         assert (algorithm.alpha_init, algorithm.target_entropy) == (0.01, -5.0)
         assert algorithm.replay == ("prioritized" if "_per" in run.label else "uniform")
-        assert algorithm.augmentation == "none"
+        assert (algorithm.priority_exponent, algorithm.importance_exponent) == (0.6, 0.4)
+        assert algorithm.expert_bonus == 1.0
+        rotation = ("so2", 4) if "_so2" in run.label else ("none", 0)
+        assert (algorithm.augmentation, algorithm.stored_copies) == rotation
         assert (algorithm.demonstration_weight > 0) is ("sacfd" in run.label)
 
 
@@ -126,20 +137,43 @@ def test_an_unknown_preset_is_refused_with_the_known_ones():
         shipped("close_loop_4d", "algorithms=[sacdf]")
 
 
+def check_open_loop(run):
+    """Assert that a run has the values of appendix G.1 that all open-loop benchmarks share."""
+    env, algorithm = run.resolved_env.config, run.algorithm_config
+    low, high = np.transpose(env.workspace)
+    assert env.robot == "kuka"
+    assert (high - low)[:2] == pytest.approx([0.4, 0.4])
+    assert run.network_config.precision == "float32"
+    assert run.only_successful_demonstrations
+    assert (run.num_envs, run.eval_every) == (5, 500)
+    assert (algorithm.learning_rate, algorithm.weight_decay) == (1e-4, 1e-5)
+    assert (algorithm.gamma, algorithm.batch_size, algorithm.buffer_size) == (0.95, 16, 100_000)
+    assert (algorithm.replay, algorithm.epsilon_init, algorithm.epsilon_end) == ("symmetric", 0, 0)
+    if algorithm.demonstrations in ("sdqfd", "dqfd"):
+        assert (algorithm.demonstration_weight, algorithm.margin) == (0.1, 0.1)
+
+
 @pytest.mark.parametrize("name", ["open_loop_2d", "open_loop_3d"])
 def test_open_loop_benchmarks_have_the_values_of_the_appendix_or_the_reference(name):
     config, common, runs = shipped(name, "network.width=0.1")  # planning builds each network
     known = {task for task in tasks_of("open_loop") if task.startswith("open_loop/")}
-    left_out = {"open_loop/box_palletizing"} if name == "open_loop_2d" else set()
-    assert set(config.tasks) == known - left_out
+    assert set(config.tasks) == known
     assert config.seed_list() == [0, 1, 2, 3]
     assert common["env"]["action_sequence"] == {"2": "pxy", "3": "pxyr"}[name[-2]]
     assert common["env"]["random_orientation"] is (name == "open_loop_3d")
     assert (common["env"]["obs_size"], common["env"]["in_hand_size"]) == (128, 24)
     assert (common["demonstrations"], common["num_envs"]) == (200, 5)
     assert (common["total_updates"], common["eval_every"]) == (20_000, 500)
-    assert {run.algorithm_config.gamma for run in runs} == {0.95}
-    if name == "open_loop_3d":
+    assert config.algorithms == ["sdqfd", "dqfd", "adet", "dqn"]
+    for run in runs:
+        check_open_loop(run)
+    own = {run.task: run.resolved_env.config for run in runs}
+    is_turned = name == "open_loop_3d"
+    assert own["open_loop/box_palletizing"].num_objects == (18 if is_turned else 6)
+    assert own["open_loop/object_grasping"].max_attempts == (NEVER if is_turned else None)
+    if not is_turned:
+        assert len(runs) == 12 * 4 * 2 * 4
+    else:
         assert len(runs) == 12 * (5 + 3) * 4
         assert {run.resolved_env.config.obs_size for run in runs if "rot_fcn" in run.label} == {90}
         assert config.per_network["rot_fcn"] == {"env": {"obs_size": 90}}
@@ -159,7 +193,7 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
     assert len(runs) == 9 * (2 + 3) * 4
     assert (common["total_updates"], common["eval_every"], common["num_envs"]) == (20_000, 500, 5)
     for run in runs:
-        env, network, algorithm = run.resolved_env.config, run.network_config, run.algorithm_config
+        env, network = run.resolved_env.config, run.network_config
         is_bump = run.task in bumps
         assert (env.action_sequence, env.in_hand_mode) == ("pxyzrrr", "proj")
         assert (env.obs_size, env.in_hand_size) == (128, 40 if is_bump else 24)
@@ -169,8 +203,7 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
         assert network.max_tilt_rad == pytest.approx(math.pi / 8)
         if run.network["name"] == "equi_deictic_asr":
             assert (network.scene_head, network.swap_fingers) == ("flatten", False)
-        assert (algorithm.learning_rate, algorithm.weight_decay) == (1e-4, 1e-5)
-        assert (algorithm.gamma, algorithm.batch_size) == (0.95, 16)
+        check_open_loop(run)
     labels = {run.label for run in runs}
     assert {"sdqfd equi_deictic_asr", "sdqfd asr", "adet equi_deictic_asr"} < labels
     assert "adet asr" not in labels
