@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from ba_torchrl.envs import keys
+from ba_torchrl.sim.contacts import contacts, vertical_force_n
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
@@ -150,6 +151,8 @@ def test_a_pull_keeps_the_outlines_of_the_blocks_in_the_workspace(make_env):
         ("close_loop/corner_picking", 0.2),
         ("close_loop/drawer_opening", 0.2),
         ("open_loop/bottle_arrangement", 0.018),
+        ("open_loop/covid_test", 0.018),
+        ("open_loop/object_grasping", 0.018),
     ],
 )
 def test_a_policy_with_errors_succeeds(make_env, task, error):
@@ -175,3 +178,58 @@ def test_a_policy_with_errors_succeeds(make_env, task, error):
         episode = env.rollout(50, with_error, auto_reset=False, tensordict=start)
         solved += bool(episode[keys.NEXT, keys.SUCCESS][-1])
     assert solved >= 8
+
+
+def shift(bodies, rng, distance_m=5e-4):
+    """Move each body by a distance in a random direction."""
+    for body in bodies:
+        step = rng.normal(size=3)
+        position = np.add(body.position, distance_m * step / np.linalg.norm(step))
+        body.set_pose(tuple(position.tolist()), body.pose.orientation)
+
+
+def test_a_pick_from_a_heap_depends_on_what_the_image_shows(make_env):
+    """Neither failed picks nor half a millimetre change the pick of most heaps."""
+    env = make_env("open_loop/object_grasping", obs_size=128)
+    rng, same = np.random.default_rng(0), 0
+    for seed in range(6):
+        state = env.reset(seed=seed)
+        action = state[keys.EXPERT_ACTION]
+        idle(env, state)
+        assert torch.allclose(env.reset()[keys.EXPERT_ACTION], action, atol=1e-4)
+        shift(env.scene.task.objects, rng)
+        distance = env._expert_action(env.scene)[1:3] - action[1:3].numpy()
+        same += bool(np.abs(distance).max() < env.pixel_m)
+    assert same >= 5
+
+
+def test_a_hand_on_the_block_drags_it_with_any_force(make_env):
+    env = make_env("close_loop/corner_picking")
+    state, scene, task = env.reset(), env.scene, env.scene.task
+
+    def force_n():
+        return vertical_force_n(contacts(scene.world.client, scene.robot.id, task.block.id))
+
+    while force_n() < 5:
+        state = env.step(expert_policy(state))[keys.NEXT]
+    pressing, pose = task.expert_command(), task.block.pose
+    assert max(abs(pressing.dx_m), abs(pressing.dy_m)) > 0.02
+    task.block.set_pose((0.45, 0.0, 1.0), pose.orientation)
+    scene.world.detect_collisions()
+    task.block.set_pose(*pose)  # the same scene without forces
+    assert force_n() == 0
+    assert task.expert_command() == pressing
+
+
+@pytest.mark.parametrize("shift_m", [-5e-4, 5e-4])
+def test_the_tube_nearest_to_the_test_area_is_picked(make_env, shift_m):
+    """Half a millimetre of a tube's pose, and so of the clearances, does not change the pick."""
+    env = make_env("open_loop/covid_test", random_orientation=False)
+    env.reset()
+    task = env.scene.task
+    x, y, z = task.tubes[0].position
+    task.tubes[0].set_pose((x + shift_m, y, z), task.tubes[0].pose.orientation)
+    area = task.layout.test_area.position[:2]
+    nearest = min(task.tubes, key=lambda tube: np.hypot(*np.subtract(tube.position[:2], area)))
+    command = task.expert_command()
+    assert (command.x_m, command.y_m) == nearest.position[:2]

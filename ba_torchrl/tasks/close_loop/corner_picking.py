@@ -10,7 +10,6 @@ import numpy as np
 
 from ba_torchrl.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.contacts import contacts, gap_m, vertical_force_n
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import box_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
@@ -45,12 +44,12 @@ DRAG_CLEARANCE_M = 15e-3
 """Clearance at which a drag ends, larger than for a grasp so that no second drag follows."""
 DRAG_GOAL_M = 0.0
 """Target of a drag along both axes of the corner's frame."""
-PRESS_FORCE_N = 2.0
-"""Least force of closed fingers on the block for a drag."""
-PRESS_M = 5e-3
-"""Commanded depth of the fingertips below the top of the block; the motion stops at contact."""
+DRAG_HEIGHT_M = 3e-3
+"""Largest height above the block of closed fingertips that press on it and drag it."""
+PRESS_M = 4e-3
+"""Commanded depth of the fingertips below the top of the block during a drag."""
 APPROACH_GAP_M = 5e-4
-"""Gap between the fingertips and the block before the press. From less than a millimetre the
+"""Gap between the fingertips and the block before the drag. From less than a millimetre the
 fingers move slowly and do not hit the block."""
 APPROACH_TOLERANCE_M = 3e-3
 """Tolerance of the height at the end of the approach."""
@@ -74,6 +73,8 @@ class CornerPicking(CloseLoopTask):
     and walls. The base has almost no friction, so that closed fingers that press on the block can
     drag it out. The episode ends early when the block leaves the workspace. Paper, appendix A.2.
     """
+
+    expert_version = 1
 
     base_m: ClassVar[float] = 0.2
     """Edge of the base, metres."""
@@ -163,17 +164,16 @@ class CornerPicking(CloseLoopTask):
         if grasped_body(robot) is block:
             return lift(limits.step_m)
         yaw = robot.tool_pose()[1]
-        touching = contacts(self.world.client, robot.id, block.id)
-        is_pressing = robot.opening() < 0.5 and vertical_force_n(touching) > PRESS_FORCE_N
+        is_on_block = self._is_on_block()
         yaws = [
             nearest_equivalent_yaw(yaw, block.yaw_rad + k * math.pi / 2, limits, math.pi)
             for k in (0, 1)
         ]
-        needed = DRAG_CLEARANCE_M if is_pressing else GRASP_CLEARANCE_M
+        needed = DRAG_CLEARANCE_M if is_on_block else GRASP_CLEARANCE_M
         yaws = [wanted for wanted in yaws if self.clearance_m(wanted) >= needed]
         if not yaws:
-            return self._drag() if is_pressing else self._press()
-        if is_pressing:  # steeply up and without rotation, so that the block does not move along
+            return self._drag() if is_on_block else self._press()
+        if is_on_block:  # steeply up and without rotation, so that the block does not move along
             x, y, z = block.position
             above_z = z + self.block_m / 2 + self._tips_below_m + PASSING_CLEARANCE_M
             return move_toward(robot, (x, y, above_z), yaw, OPEN)
@@ -195,13 +195,29 @@ class CornerPicking(CloseLoopTask):
             for b, extent in zip(position, extents, strict=True)
         )
 
+    def _is_on_block(self) -> bool:
+        """Whether closed fingertips are on the block, or just above it."""
+        if self.robot.opening() >= IS_CLOSED:
+            return False
+        frame = PlanarFrame(*self.block.position[:2], self.block.yaw_rad)
+        offset = frame.to_local(*self.robot.tool_pose()[0][:2])
+        if max(map(abs, offset)) > self.block_m / 2:
+            return False
+        return -self.block_m / 4 < self._height_m < DRAG_HEIGHT_M
+
+    @property
+    def _height_m(self) -> float:
+        """Height of the closed fingertips above the top of the block, metres."""
+        top = vertical_extent(self.block)[1]
+        return self.robot.tool_pose()[0][2] - self._tips_below_m - top
+
     @property
     def _tips_below_m(self) -> float:
         """Distance of the closed fingertips below the tool point, metres."""
         return -self.robot.gripper.tip_height_m(0.0)
 
     def _press(self) -> GripperCommand:
-        """Move above the block with closed fingers, descend and press.
+        """Move above the block with closed fingers, and descend to it.
 
         The hand descends while it moves and turns, wherever it is clear of the walls on a straight
         way to the press.
@@ -237,11 +253,6 @@ class CornerPicking(CloseLoopTask):
                 return lift(low_z - z, closing(robot))
         elif z < low_z - APPROACH_TOLERANCE_M / 2 and distance > PRESS_TOLERANCE_M:
             return lift(low_z + APPROACH_TOLERANCE_M - z)  # a low hand would push the block back
-        elif distance < PRESS_TOLERANCE_M:
-            gap = gap_m(self.world.client, robot.id, self.block.id)
-            if gap <= 2 * APPROACH_GAP_M:
-                return lift(-PRESS_M)
-            low_z = z + max(APPROACH_GAP_M - gap, low_z - z - limits.step_m)
         return move_toward(robot, (*target, low_z), target_yaw, closing(robot))
 
     def _wall_gap_m(self, x: float, y: float, hand_half_m: float, turn_rad: float) -> float:
@@ -260,13 +271,19 @@ class CornerPicking(CloseLoopTask):
         return min(along, across) - inner
 
     def _drag(self) -> GripperCommand:
-        """Drag the block away from both walls, straight towards its target."""
+        """Press on the block and drag it away from both walls, straight towards its target.
+
+        The lower the fingertips, the longer the displacement, up to that of fingers on the block.
+        """
         goal = self.corner.to_world(
             *(max(b, DRAG_GOAL_M) for b in self.corner.to_local(*self.block.position[:2]))
         )
         dx, dy = (g - b for g, b in zip(goal, self.block.position, strict=False))
-        share = min(1.0, self.action_limits.step_m / max(abs(dx), abs(dy), 1e-6))
-        return GripperCommand(CLOSED, share * dx, share * dy, 0.0, 0.0)
+        height = self._height_m
+        step_m = self.action_limits.step_m * min((DRAG_HEIGHT_M - height) / DRAG_HEIGHT_M, 1.0)
+        share = min(1.0, step_m / max(abs(dx), abs(dy), 1e-6))
+        dz = min(-PRESS_M - height, 0.0)
+        return GripperCommand(CLOSED, share * dx, share * dy, dz, 0.0)
 
     @property
     def objects(self) -> Sequence[Body]:

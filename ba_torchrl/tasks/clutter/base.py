@@ -70,8 +70,6 @@ class ClutterTask(Task):
         parameters = self.settings.parameters
         self.attempts = 0
         """Episodes with the present heap that have ended."""
-        self.failures = 0
-        """The last of them in a row without a grasped object."""
         self.max_attempts = parameters.max_attempts
         if self.max_attempts is None:
             self.max_attempts = self.default_max_attempts()
@@ -94,7 +92,7 @@ class ClutterTask(Task):
         They start with random orientations, or with the identity if orientations are fixed, and
         tumble as they hit the tray and each other.
         """
-        self.attempts = self.failures = 0
+        self.attempts = 0
         settings, world, pool = self.settings, self.world, self.pool
         center = np.array(settings.workspace.center)
         half_m = self.terrain.half_m
@@ -136,11 +134,8 @@ class ClutterTask(Task):
         """Count an attempt, and remove the grasped object from the scene."""
         grasped_object = self.grasped_object()
         self.attempts += 1
-        if grasped_object is None:
-            self.failures += 1
-        else:
+        if grasped_object is not None:
             self.pool.deactivate(grasped_object)
-            self.failures = 0
 
     @cached_property
     def planner(self) -> GraspPlanner:
@@ -166,11 +161,11 @@ class ClutterTask(Task):
         poses = [(body.position, body.yaw_rad) for body in self.objects]
         return poses + [(corner, 0.0)] * (self.settings.num_objects - len(poses))
 
-    def get_state(self) -> tuple[tuple[int, ...], int, int]:
-        """Return the indices of the active objects and the numbers of attempts and failures."""
-        return self.pool.get_state(), self.attempts, self.failures
+    def get_state(self) -> tuple[tuple[int, ...], int]:
+        """Return the indices of the active objects and the number of attempts."""
+        return self.pool.get_state(), self.attempts
 
-    def set_state(self, state: tuple[tuple[int, ...], int, int]) -> None:
-        """Restore the active objects and the numbers of attempts and failures."""
-        active, self.attempts, self.failures = state
+    def set_state(self, state: tuple[tuple[int, ...], int]) -> None:
+        """Restore the active objects and the number of attempts."""
+        active, self.attempts = state
         self.pool.set_state(active)

@@ -18,7 +18,6 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.body_pool import deactivate_body
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m
 from ba_torchrl.tasks.manipulation.commands import (
     no_op,
     perturbed_pick,
@@ -208,6 +207,7 @@ class CovidTest(OpenLoopTask):
     the last tube is collected, or when an object leaves the workspace. Paper, appendix A.1.
     """
 
+    expert_version = 1
     scale_limits = (0.5, 0.66)
     max_steps = 30
     num_objects = 6
@@ -389,14 +389,19 @@ class CovidTest(OpenLoopTask):
         )
 
     def expert_command(self) -> PickPlaceCommand:
-        """Collect a used tube, or present a tube or swab that is missing for the next test."""
+        """Collect a used tube, or present a tube or swab that is missing for the next test.
+
+        Of several, it picks the one nearest to the test area that the fingers can grasp.
+        """
         held = self.robot.held_body()
         if held is not None:
             return self._place(held)
         candidates = self._pick_candidates()
         if not candidates:
             return no_op(self.settings.workspace, is_holding=False)
-        body = max(candidates, key=lambda body: (self._can_grasp(body), self._clearance_m(body)))
+        test_area = self.layout.test_area.position[:2]
+        nearest = sorted(candidates, key=lambda body: math.dist(body.position[:2], test_area))
+        body = next(filter(self._can_grasp, nearest), nearest[0])
         x, y, _ = body.position
         z = vertical_extent(body)[0] + self._grasp_m
         grasp = downward_pose((x, y, z), self._grasp_yaw(body))
@@ -480,9 +485,3 @@ class CovidTest(OpenLoopTask):
 
     def _grasp_yaw(self, body: Body) -> float:
         return body.yaw_rad + math.pi / 2 if self.action_limits.turn_rad else 0.0
-
-    def _clearance_m(self, body: Body) -> float:
-        """Return the clearance of the grasp of a body."""
-        others = [other for other in self.objects if other is not body] + self.layout.walls
-        yaw = self._grasp_yaw(body)
-        return grasp_clearance_m(self.robot.gripper, body, yaw, others, self.finger_opening)

@@ -14,6 +14,7 @@ from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
 from ba_torchrl.tasks.manipulation.commands import pick_command
+from ba_torchrl.tasks.manipulation.footprints import Rectangle
 
 OBJECT_WIDTH_M = 0.045
 """Assumed width of the object between the fingers, for picks without z."""
@@ -28,8 +29,6 @@ SLIP_COST = 30.0
 HEIGHT_ERROR_COST_PER_M = 4500.0
 """Cost of the difference between the height of a grasp and that of a pick without z at its
 position; fitted to picks of random grasps."""
-COST_TOLERANCE = 60.0
-"""After failures the expert chooses among the grasps within this cost of the best one."""
 
 
 @TASKS.register("open_loop/object_grasping")
@@ -39,6 +38,7 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
     Goal: an object is held. Every episode ends after one pick. Paper, appendix A.1.
     """
 
+    expert_version = 1
     max_steps = 1
     terminates_at_limit = True
     num_objects = 15
@@ -70,21 +70,15 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         return WINDOW_M
 
     def expert_command(self) -> PickPlaceCommand:
-        """Return the pick with the lowest cost; after failures one with the next lowest costs."""
+        """Return the pick with the lowest cost."""
         workspace = self.settings.workspace
         x, y = workspace.center
         if self.grasped_object() is not None:  # the episode is over; the object is placed back
             return PickPlaceCommand(PLACE, x, y, workspace.z[1] / 2)
-        planner, objects = self.planner, self.pool.active
-        heights, tool = planner.heights(), ((x, y, workspace.z[1]), 0.0)
+        heights, tool = self.planner.heights(), ((x, y, workspace.z[1]), 0.0)
         penalty = partial(self._penalty, _highest(heights))
-        grasps = [planner.plan([b], tool, self.action_limits, heights, penalty) for b in objects]
-        found = sorted(filter(None, grasps), key=lambda grasp: grasp.cost)
-        if not found:
-            return self._fallback_pick()
-        best = [grasp for grasp in found if grasp.cost < found[0].cost + COST_TOLERANCE]
-        grasp = best[self.failures % len(best)]
-        return pick_command(grasp.tool)
+        grasp = self.planner.plan(self.pool.active, tool, self.action_limits, heights, penalty)
+        return self._fallback_pick() if grasp is None else pick_command(grasp.tool)
 
     def _penalty(self, highest: np.ndarray, grasps: np.ndarray) -> np.ndarray:
         """Return the additional costs [N] of grasps.
@@ -105,19 +99,23 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         return SLIP_COST * grasps[:, 5] + HEIGHT_ERROR_COST_PER_M * errors
 
     def _fallback_pick(self) -> PickPlaceCommand:
-        """Return a pick of the highest object, after failures of the next, across its least width.
+        """Return a pick of the highest object across its least width, the fingers above the floor.
 
         Even if the grasp fails, the object moves, and may be graspable afterwards.
         """
-        samples = [self.planner.placed_samples(body)[:, :3] for body in self.pool.active]
-        samples.sort(key=lambda points: points[:, 2].max(), reverse=True)
-        points = samples[self.failures % len(samples)]
+        samples = (self.planner.placed_samples(body)[:, :3] for body in self.pool.active)
+        points = max(samples, key=lambda points: points[:, 2].max())
         yaws = np.arange(YAWS) * np.pi / YAWS if self.action_limits.turn_rad else np.zeros(1)
         across = points[:, :2] @ np.array([np.cos(yaws), np.sin(yaws)])
-        x, y = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
-        z = self.pick_height_m(points[:, 2].max(), (float(x), float(y)))
-        yaw = yaws[np.ptp(across, axis=0).argmin()]
-        return pick_command(downward_pose((float(x), float(y), float(z)), float(yaw)))
+        yaw = float(yaws[np.ptp(across, axis=0).argmin()])
+        gripper, half_m = self.robot.gripper, self.terrain.half_m
+        fingers = Rectangle(0.0, 0.0, yaw, gripper.finger_reach_m, gripper.half_width_m)
+        reach, center = np.subtract(half_m, fingers.extents_m(0.0)), self.settings.workspace.center
+        middle = (points[:, :2].max(axis=0) + points[:, :2].min(axis=0)) / 2
+        x, y = np.clip(middle, center - reach, center + reach).tolist()
+        return pick_command(
+            downward_pose((x, y, self.pick_height_m(points[:, 2].max(), (x, y))), yaw)
+        )
 
     def grasped_object(self) -> Body | None:
         """Return the object that the last pick lifted; it is hidden from the cameras."""

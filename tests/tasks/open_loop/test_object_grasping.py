@@ -95,14 +95,6 @@ def test_the_pick_height_is_below_the_highest_point_between_the_fingers(with_bri
     assert task.window_m(None) == pytest.approx(task.robot.gripper.half_width_m, abs=4e-3)
 
 
-def test_the_expert_selects_another_grasp_after_failures(make):
-    env = make(expert=True)
-    first = env.reset()["expert_action"]
-    play(env, env.reset(), NO_OP)
-    second = env.reset()["expert_action"]
-    assert math.dist(first[1:3].tolist(), second[1:3].tolist()) > 0.03
-
-
 def test_without_a_feasible_grasp_the_expert_picks_the_highest_object(make, tmp_path):
     (tmp_path / "slab").mkdir()
     write_obj(tmp_path / "slab" / "mesh.obj", [box_mesh((0.11, 0.1, 0.05))])
