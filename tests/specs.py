@@ -1,6 +1,8 @@
 """What networks are built for in the tests, and which cases of a sweep are slow tests."""
 
 import pytest
+from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import ActorCriticSpec
@@ -12,6 +14,18 @@ def slow_except(values, fast):
     return [
         value if value in fast else pytest.param(value, marks=pytest.mark.slow) for value in values
     ]
+
+
+def from_replay(transform, data):
+    """Return transitions in their order, sampled from TorchRL's replay with a transform."""
+    replay = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(len(data)), sampler=SamplerWithoutReplacement(shuffle=False)
+    )
+    replay.append_transform(transform)
+    replay.extend(data.clone())
+    sampled = replay.sample(len(data))
+    assert (replay.storage[:].select(*data.keys(True, True)) == data).all()
+    return sampled
 
 
 def close_loop_images(size=64, high_m=0.39):

@@ -59,9 +59,9 @@ def perturb(noise):
 
 def learn(parts):
     """Return the losses of an augmented batch, and the action in its states."""
-    policy, loss, augmentation, batch = parts
+    policy, loss, transform, batch = parts
     torch.manual_seed(0)
-    batch = augmentation(batch.clone())
+    batch = transform(batch.clone())
     with set_exploration_type(ExplorationType.RANDOM):
         return loss(batch), policy(batch.clone())["action"]
 
@@ -80,7 +80,7 @@ def learner(algorithm, network, **settings):
 
 def learner_parts(*args, **settings):
     of = learner(*args, **settings)
-    return of.policy, of.loss, of.augmentation, of.replay.sample()
+    return of.policy, of.loss, of.replay.transform, of.replay.storage[:4].clone()
 
 
 def started(task, **config):

@@ -1,6 +1,7 @@
 """TorchRL's parts around ours: the scripts of recipes/torchrl, and what docs/torchrl.md lists."""
 
 import ast
+import contextlib
 import importlib
 import importlib.util
 from functools import partial
@@ -8,13 +9,14 @@ from pathlib import Path
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl import collectors, envs
 from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import ba_torchrl
-from ba_torchrl.data import as_transitions
+from ba_torchrl.data import ImageCodecs, as_transitions
 from ba_torchrl.envs import keys
 
 FOLDER = Path(__file__).parents[1] / "recipes" / "torchrl"
@@ -154,6 +156,27 @@ def test_environments_in_a_vector_of_torchrl(name, task):
         assert vector.rollout(3, break_when_any_done=False).shape == (2, 3)
     finally:
         vector.close()
+
+
+def with_transform(make, transform):
+    return envs.TransformedEnv(make(), transform)
+
+
+def test_a_codec_is_the_same_inside_and_around_a_vector_of_torchrl():
+    plain = makers(REACH)
+    with contextlib.closing(plain[0]()) as env:
+        codecs = [ImageCodecs(env.images) for _ in range(3)]
+    inside = [partial(with_transform, make, codecs[i]) for i, make in enumerate(plain)]
+    vectors = [
+        envs.ParallelEnv(2, inside, mp_start_method="fork"),
+        envs.TransformedEnv(envs.ParallelEnv(2, plain, mp_start_method="fork"), codecs[2]),
+    ]
+    first, second = (vector.rollout(2) for vector in vectors)
+    for vector in vectors:
+        vector.close()
+    for images in (first["depth"], first["next", "depth"]):
+        assert torch.equal(codecs[2](TensorDict(depth=images.clone()))["depth"], images)
+    assert torch.equal(first["depth"][:, 0], second["depth"][:, 0])
 
 
 COLLECTORS = {

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import nn
+from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.envs import keys
@@ -22,13 +23,13 @@ def constant_weights() -> Iterator[None]:
 
 
 class ActingPolicy(TensorDictModuleBase):
-    """A policy on images that are transformed as in training, such as by the replay's codecs.
+    """A policy on an environment's observations, which are transformed as in training.
 
     It writes ``action`` and nothing else.
 
     Args:
-        policy: from the observation to ``action``.
-        transforms: transform of each image, by key.
+        policy: from the transformed observation to ``action``.
+        transforms: of the observation, in this order, such as the replay's codecs.
         exploration: changes the action, such as by noise; called under TorchRL's exploration type
             RANDOM only. None for the policy's own action.
     """
@@ -36,12 +37,12 @@ class ActingPolicy(TensorDictModuleBase):
     def __init__(
         self,
         policy: TensorDictModuleBase,
-        transforms: Mapping[str, nn.Module],
+        transforms: Iterable[Transform],
         exploration: TensorDictModuleBase | None = None,
     ) -> None:
         super().__init__()
         self.policy = policy
-        self.transforms = nn.ModuleDict(transforms)
+        self.transforms = nn.ModuleList(transforms)
         self.exploration = exploration
         self.in_keys = list(policy.in_keys)
         self.out_keys = [keys.ACTION]
@@ -49,8 +50,8 @@ class ActingPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of a root TensorDict of any batch shape."""
         seen = tensordict.select(*self.in_keys)
-        for key, transform in self.transforms.items():
-            seen.set(key, transform(seen[key]))
+        for transform in self.transforms:
+            seen = transform(seen)
         out = self.policy(seen)
         if self.exploration is not None and exploration_type() is ExplorationType.RANDOM:
             out = self.exploration(out)

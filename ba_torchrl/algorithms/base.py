@@ -22,6 +22,7 @@ from torch.optim import Adam, Optimizer
 from torch.optim.lr_scheduler import LinearLR, LRScheduler
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 from torchrl.data import ReplayBuffer
+from torchrl.envs import Transform
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 from typing_extensions import Self
@@ -32,10 +33,10 @@ from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.optimizers import Optimizers
 from ba_torchrl.config import StrictModel, changed
-from ba_torchrl.data.replay.codecs import make_codecs
+from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_device
+from ba_torchrl.data.transfer import batch_to_device, to_device
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation, as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -275,6 +276,8 @@ class Learner(ABC):
     exploration type RANDOM and is greedy under DETERMINISTIC."""
     updates: int = 0
     """Gradient updates so far."""
+    entries_per_transition: int = 1
+    """Entries of the replay that its transforms make of a new transition."""
 
     def __init__(self, config: LearnerConfig, network: NetworkConfig, problem: Problem) -> None:
         self.config = config
@@ -313,8 +316,10 @@ class Learner(ABC):
         self.init_loss = self.make_init_loss() if config.init == "bc" else None
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
-        self.stored_augmentation = self.make_stored_augmentation()
-        self.augmentation = self.make_augmentation()
+        if problem.device.type != "cpu":
+            self.replay.append_transform(ImageCodecs(self.images, device=problem.device))
+        for transform in self.make_transforms():
+            self.replay.append_transform(transform)
         self.optimizer = self.make_optimizer()
         self.optimizers = Optimizers(
             self.optimizer,
@@ -367,9 +372,10 @@ class Learner(ABC):
         loss.set_keys(action=keys.TARGET_ACTION)
         return loss
 
-    def make_acting_transforms(self) -> Mapping[str, nn.Module]:
-        """Return the transform of each image that the acting policy sees; by default its codec."""
-        return self.codecs
+    def make_acting_transforms(self) -> list[Transform]:
+        """Return the transforms of the observation that the acting policy sees; by default the
+        images' codecs."""
+        return [ImageCodecs(self.images)]
 
     def make_exploration(self) -> TensorDictModuleBase | None:
         """Return what changes the actions of the acting policy, called only when it explores; by
@@ -405,14 +411,10 @@ class Learner(ABC):
             returns_codes=self.problem.device.type != "cpu",
         )
 
-    def make_stored_augmentation(self) -> nn.Module:
-        """Return the map from new transitions [N] to those that are stored; by default the
-        identity."""
-        return nn.Identity()
-
-    def make_augmentation(self) -> nn.Module:
-        """Return the augmentation of sampled batches; by default the identity."""
-        return nn.Identity()
+    def make_transforms(self) -> list[Transform]:
+        """Return the transforms of the replay, called on sampled batches and, their inverse, on new
+        transitions; by default none."""
+        return []
 
     def make_optimizer(self) -> Optimizer:
         """Return the optimiser of all terms of the loss but those of `make_term_optimizers`."""
@@ -478,10 +480,10 @@ class Learner(ABC):
     def extend(self, transitions: TensorDictBase) -> None:
         """Add transitions [N], and augmented copies if configured, to the replay, except those with
         a fault."""
-        stored = self.stored_augmentation(transitions)
-        if len(self.replay) + len(stored) > self.config.buffer_size:
+        new = self.entries_per_transition * len(transitions)
+        if len(self.replay) + new > self.config.buffer_size:
             self.host_tasks.run()  # before its transitions are overwritten: deferred priorities
-        self.replay.extend(stored)
+        self.replay.extend(transitions)
 
     @property
     def replay_size(self) -> int:
@@ -496,11 +498,8 @@ class Learner(ABC):
             sampler.anneal(self._annealing_progress())
         batch, device = self.replay.sample(), self.problem.device
         is_demonstration = batch[keys.IS_DEMONSTRATION] if demonstrations_only else None
-        if device.type == "cpu":
-            batch = self.augmentation(batch)
-        else:
-            batch = decoded_on_device(batch, self.codecs, device)
-            batch = batch_to_device(self.augmentation(batch), device)
+        if device.type != "cpu":
+            batch = batch_to_device(batch, device)
         if is_demonstration is None:
             return batch
         return batch[to_device(is_demonstration.reshape(-1).nonzero()[:, 0], device)]
@@ -603,13 +602,13 @@ class Learner(ABC):
     # -- state -------------------------------------------------------------------------------
 
     def _stateful_parts(self) -> dict[str, nn.Module]:
-        names = ("loss", "stored_augmentation", "augmentation", "averaged_policy")
+        names = ("loss", "averaged_policy")
         parts = {name: getattr(self, name) for name in names}
         return {name: part for name, part in parts.items() if part is not None}
 
     def generators(self) -> Mapping[str, torch.Generator]:
         """Return the generators whose states are saved, by name, besides those of the replay and
-        the augmentations; by default none."""
+        its transforms; by default none."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:

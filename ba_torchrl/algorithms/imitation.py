@@ -15,6 +15,7 @@ from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
+from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
@@ -126,11 +127,11 @@ class BC(Learner):
         loss.set_keys(action=keys.TARGET_ACTION)
         return loss
 
-    def make_augmentation(self) -> nn.Module:
+    def make_transforms(self) -> list[Transform]:
         """Return the rigid transforms of sampled open-loop transitions."""
         if self.actions is None:
-            return super().make_augmentation()
-        return self.config.make_augmentation(
+            return []
+        return self.config.make_transforms(
             self.problem, self.images, self.actions, keys.TARGET_ACTION
         )
 

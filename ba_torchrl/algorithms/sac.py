@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.optim import Optimizer
 from torchrl.data import Bounded
+from torchrl.envs import Transform
 from torchrl.modules import AdditiveGaussianModule, ProbabilisticActor
 from torchrl.objectives import SoftUpdate
 from typing_extensions import Self
@@ -193,12 +194,12 @@ class SAC(Learner):
         """Return the squashed Gaussian of the actor."""
         return squashed_gaussian_policy(networks.actor, self.observation_keys)
 
-    def make_acting_transforms(self) -> Mapping[str, nn.Module]:
-        """Return the codec of each image, and its central part where the networks see crops."""
-        if self.config.view_transform != "crop":
-            return self.codecs
-        crop = CenterCrop(self.config.crop_size)
-        return {key: nn.Sequential(codec, crop) for key, codec in self.codecs.items()}
+    def make_acting_transforms(self) -> list[Transform]:
+        """Return the images' codecs, and their central part where the networks see crops."""
+        transforms = super().make_acting_transforms()
+        if self.config.view_transform == "crop":
+            transforms.append(CenterCrop(self.config.crop_size, list(self.images)))
+        return transforms
 
     def make_exploration(self) -> AdditiveGaussianModule | None:
         """Return the noise of collected actions, if configured."""
@@ -271,17 +272,19 @@ class SAC(Learner):
         taus = {"encoder_network": config.encoder_tau}
         return SoftUpdateByNetwork(self.loss, tau=config.tau, taus=taus)
 
-    def make_stored_augmentation(self) -> nn.Module:
-        """Return the rotated copies that are stored with each transition, if configured."""
-        if not self.config.stored_copies:
-            return nn.Identity()
-        rotation = self._make_rotation(1.0, SeedUse.STORED_AUGMENTATION)
-        return StoredCopies(rotation, self.config.stored_copies)
+    @property
+    def entries_per_transition(self) -> int:
+        """A transition and its rotated copies."""
+        return 1 + self.config.stored_copies
 
-    def make_augmentation(self) -> nn.Module:
-        """Return the rotation of sampled transitions and the views of images, if configured."""
+    def make_transforms(self) -> list[Transform]:
+        """Return the rotation, of stored copies or of sampled transitions, and the views of images,
+        if configured."""
         config, parts = self.config, []
-        if config.augmentation == "so2" and not config.stored_copies:
+        if config.stored_copies:
+            rotation = self._make_rotation(1.0, SeedUse.STORED_AUGMENTATION)
+            parts.append(StoredCopies(rotation, config.stored_copies))
+        elif config.augmentation == "so2":
             probability = config.augmentation_probability
             parts.append(self._make_rotation(probability, SeedUse.AUGMENTATION))
         if config.view_transform != "none":
@@ -298,9 +301,7 @@ class SAC(Learner):
                     seed=self.problem.derived_seed(SeedUse.VIEWS),
                 )
             )
-        if len(parts) > 1:
-            return nn.Sequential(*parts)
-        return parts[0] if parts else nn.Identity()
+        return parts
 
     def make_optimizer(self) -> Optimizer:
         """Return Adam for all parameters but the contrastive loss's similarity."""
@@ -343,8 +344,8 @@ class SAC(Learner):
         if is_demonstration or self.episodes is None:
             return super().to_transitions(data, is_demonstration=is_demonstration)
         data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
-        copies = 1 + self.config.stored_copies
-        stored = self.replay.num_demonstrations + copies * int(data[keys.IS_EXPERT].sum())
+        new = self.entries_per_transition * int(data[keys.IS_EXPERT].sum())
+        stored = self.replay.num_demonstrations + new
         if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
         return super().to_transitions(data, is_demonstration=True)

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping
 import torch
 from pydantic import Field
 from tensordict import TensorDictBase
+from torchrl.envs import Transform
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import LearnerConfig, Problem, SeedUse
@@ -37,20 +38,22 @@ class RigidAugmentationConfig(LearnerConfig):
         if self.augmentation != "cn":
             yield from changed(self, ["augmentation_order"], "without augmentation='cn'")
 
-    def make_augmentation(
+    def make_transforms(
         self,
         problem: Problem,
         images: Mapping[str, ImageSpec],
         grid: SpatialActions,
         action_key: str = keys.ACTION,
-    ) -> RigidAugmentation:
-        """Return the rigid transforms of sampled transitions; arguments as for
+    ) -> list[Transform]:
+        """Return the rigid transforms of sampled transitions, if configured; arguments as for
         `RigidAugmentation`.
 
         Raises:
             ValueError: images or actions of the task cannot be transformed.
         """
-        return RigidAugmentation(
+        if self.augmentation == "none":
+            return []
+        augmentation = RigidAugmentation(
             self.augmentation,
             problem.actions,
             images,
@@ -60,6 +63,7 @@ class RigidAugmentationConfig(LearnerConfig):
             grid=grid,
             action_key=action_key,
         )
+        return [augmentation]
 
 
 def make_spatial_values(

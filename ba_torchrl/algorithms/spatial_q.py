@@ -10,6 +10,7 @@ from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import Tensor
+from torchrl.envs import Transform
 from torchrl.objectives import HardUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
@@ -19,7 +20,6 @@ from ba_torchrl.algorithms.spatial_actions import (
     make_spatial_values,
 )
 from ba_torchrl.config import changed
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.base import NetworkConfig
@@ -136,9 +136,9 @@ class SpatialQ(Learner):
         # TorchRL copies when its counter exceeds the interval, one update later.
         return HardUpdate(self.loss, value_network_update_interval=self.config.target_interval - 1)
 
-    def make_augmentation(self) -> RigidAugmentation:
+    def make_transforms(self) -> list[Transform]:
         """Return the rigid transforms of sampled transitions."""
-        return self.config.make_augmentation(self.problem, self.images, self.actions)
+        return self.config.make_transforms(self.problem, self.images, self.actions)
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the network's levels can choose."""

@@ -8,21 +8,23 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ba_torchrl.data.augmentation.rigid import RigidAugmentation
     from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-    from ba_torchrl.data.augmentation.views import RandomViews
+    from ba_torchrl.data.augmentation.views import CenterCrop, RandomViews
     from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
     from ba_torchrl.data.demos import collect_demonstrations, expert_policy, expert_scores
     from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
     from ba_torchrl.data.exchange import export_demonstrations
     from ba_torchrl.data.replay.buffer import FrameReplayBuffer
-    from ba_torchrl.data.replay.codecs import make_codecs
+    from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
     from ba_torchrl.data.replay.make import make_replay
     from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
     from ba_torchrl.data.replay.symmetric import SymmetricSampler
     from ba_torchrl.data.transitions import as_transitions
 
 _MODULES = {
+    "CenterCrop": "augmentation.views",
     "ExpertPrioritizedSampler": "replay.prioritized",
     "FrameReplayBuffer": "replay.buffer",
+    "ImageCodecs": "replay.codecs",
     "RandomViews": "augmentation.views",
     "RigidAugmentation": "augmentation.rigid",
     "SO2Augmentation": "augmentation.so2",
@@ -43,8 +45,10 @@ _MODULES = {
 """Modules of the names, imported at their first use: files and formats need no torch."""
 
 __all__ = [
+    "CenterCrop",
     "ExpertPrioritizedSampler",
     "FrameReplayBuffer",
+    "ImageCodecs",
     "RandomViews",
     "RigidAugmentation",
     "SO2Augmentation",

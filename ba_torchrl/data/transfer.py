@@ -2,14 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from tensordict import TensorDictBase
 from torch import Tensor
-
-from ba_torchrl.data.replay.codecs import ImageCodec
-from ba_torchrl.envs import keys
 
 
 def to_device(value: Tensor, device: torch.device) -> Tensor:
@@ -27,23 +22,6 @@ def to_device(value: Tensor, device: torch.device) -> Tensor:
     if device.type == "cuda" and value.device.type == "cpu":
         return value.pin_memory().to(device, non_blocking=True)
     return value.to(device)
-
-
-def decoded_on_device(
-    batch: TensorDictBase, codecs: Mapping[str, ImageCodec], device: torch.device
-) -> TensorDictBase:
-    """Return a batch whose images are decoded on a device; other entries are those of the batch.
-
-    Args:
-        batch: transitions [B] with the images' codes, on the CPU.
-        codecs: codec of each image by key.
-        device: where the images are decoded.
-    """
-    batch = batch.copy().clear_device_()
-    for key, codec in codecs.items():
-        for nested in (key, (keys.NEXT, key)):
-            batch.set(nested, codec.decode(to_device(batch[nested], device)))
-    return batch
 
 
 def batch_to_device(batch: TensorDictBase, device: torch.device) -> TensorDictBase:

@@ -16,11 +16,13 @@ from tensordict.nn import TensorDictModule
 from torchrl.checkpoint import Checkpoint
 from torchrl.collectors import Collector, Evaluator
 from torchrl.data.replay_buffers.scheduler import LinearScheduler
+from torchrl.envs import TransformedEnv
 from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import SACTrainer
 
 import ba_torchrl
 from ba_torchrl.data import (
+    ImageCodecs,
     SO2Augmentation,
     as_transitions,
     collect_demonstrations,
@@ -49,6 +51,7 @@ def main(
     make = partial(ba_torchrl.make_vector_env, task, num_envs, parallel=False, obs_size=64)
     single = ba_torchrl.make(task, obs_size=64, seed=seed + 10_000)
     images, sequence = dict(single.images), single.actions.sequence
+    single = TransformedEnv(single, ImageCodecs(images))  # images as the replay returns them
     observation = [*images, keys.HOLDING]
 
     config = EquivariantConfig(n_hidden=width, depth_center_m=0.2, depth_scale_m=0.1)
@@ -68,10 +71,10 @@ def main(
     for episode in collect_demonstrations(make(seed=seed + 20_000, expert=True), demonstrations):
         replay.extend(as_transitions(episode, images, is_demonstration=True))
     weights = LinearScheduler(replay, "beta", final_value=1.0, num_steps=updates)
-    rotate = SO2Augmentation(images, sequence, seed=seed)
+    replay.append_transform(SO2Augmentation(images, sequence, seed=seed))
 
     collector = Collector(
-        make(seed=seed),
+        TransformedEnv(make(seed=seed), ImageCodecs(images)),
         policy,
         frames_per_batch=num_envs,
         total_frames=num_envs * updates,
@@ -107,7 +110,6 @@ def main(
             rates.append(evaluator.evaluate()["eval/reward"])
             print(f"update {count}: success_rate {rates[-1]:.2f} over {eval_episodes} episodes")
 
-    trainer.register_op("process_optim_batch", rotate)
     trainer.register_op("post_optim", weights.step)
     trainer.register_op("post_steps_log", evaluate)
     trainer.train()

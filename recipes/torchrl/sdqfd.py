@@ -12,10 +12,17 @@ from functools import partial
 
 import torch
 from torchrl.collectors import Collector, Evaluator
+from torchrl.envs import TransformedEnv
 from torchrl.objectives import HardUpdate
 
 import ba_torchrl
-from ba_torchrl.data import as_transitions, collect_demonstrations, make_codecs, make_replay
+from ba_torchrl.data import (
+    ImageCodecs,
+    as_transitions,
+    collect_demonstrations,
+    make_codecs,
+    make_replay,
+)
 from ba_torchrl.modules import (
     EquiASRConfig,
     SpatialActions,
@@ -47,6 +54,7 @@ def main(
     make = partial(ba_torchrl.make_vector_env, task, num_envs, parallel=False, **settings)
     single = ba_torchrl.make(task, seed=seed + 10_000, **settings)
     images, actions = dict(single.images), single.actions
+    single = TransformedEnv(single, ImageCodecs(images))  # images as the replay returns them
 
     spec = SpatialSpec(
         images,
@@ -91,7 +99,7 @@ def main(
         collector_kwargs={"traj_format": "cat", "auto_register_policy_transforms": False},
     )
     collector = Collector(
-        make(seed=seed),
+        TransformedEnv(make(seed=seed), ImageCodecs(images)),
         policy,
         frames_per_batch=num_envs,
         total_frames=num_envs * (updates - pretrain_updates),

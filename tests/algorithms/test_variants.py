@@ -14,6 +14,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.sac import SAC
 from ba_torchrl.config import parse
+from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
 from ba_torchrl.data.augmentation.views import RandomViews
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
@@ -90,31 +91,29 @@ def test_two_updates_change_every_network(preset, network):
 @pytest.mark.parametrize("preset", ["rad", "drq", "ferm"])
 def test_a_restored_learner_continues_the_same_views(preset):
     first, second = build(preset, "cnn"), build(preset, "cnn")
-    for algorithm in (first, second):
-        algorithm.extend(transitions(algorithm))
+    first.extend(transitions(first))
     first.update()
     second.load_state_dict(first.state_dict())
-    second.replay.set_rng(torch.Generator().manual_seed(3))
-    first.replay.set_rng(torch.Generator().manual_seed(3))
+    second.load_replay_state(first.replay_state())
     assert torch.equal(first.sample()[keys.DEPTH], second.sample()[keys.DEPTH])
 
 
 def test_the_options_reach_augmentation_loss_and_target_update():
     drq = build("drq", "cnn", shift_pixels=3, views=3)
-    assert isinstance(drq.augmentation, RandomViews)
-    augmentation = drq.augmentation
+    (augmentation,) = drq.replay.transform
+    assert isinstance(augmentation, RandomViews)
     assert (augmentation.padding, augmentation.views, augmentation.target_views) == (3, 3, 2)
     assert (drq.loss.views, drq.loss.target_views) == (3, 2)
     assert drq.loss.contrastive is None
     ferm = build("ferm", "ferm", encoder_tau=0.2, tau=0.1)
-    assert ferm.augmentation.has_positive
-    assert ferm.augmentation.padding == 0
+    assert ferm.replay.transform[0].has_positive
+    assert ferm.replay.transform[0].padding == 0
     assert ferm.loss.contrastive.weight.shape == (8, 8)
     assert isinstance(ferm.target_updater, SoftUpdateByNetwork)
     assert ferm.target_updater.tau == 0.1
     assert ferm.target_updater.taus == {"encoder_network_params": 0.2}
     both = build("rad", "cnn", augmentation="so2")
-    assert [type(part).__name__ for part in both.augmentation] == ["SO2Augmentation", "RandomViews"]
+    assert [type(each) for each in both.replay.transform] == [SO2Augmentation, RandomViews]
 
 
 def test_contrastive_pretraining_trains_the_encoder_only():
@@ -238,7 +237,7 @@ def test_copies_and_conversions_of_the_loss_share_the_encoder_too(change):
 def test_the_loss_takes_tensors_by_name(preset, network):
     learner = build(preset, network)
     loss, found = learner.loss, []
-    data = learner.augmentation(transitions(learner)).select(*loss.in_keys)
+    data = learner.replay.transform(transitions(learner)).select(*loss.in_keys)
     named = {"_".join([key] if isinstance(key, str) else key): data[key] for key in loss.in_keys}
     for call in (lambda: loss(data), lambda: loss(**named)):
         torch.manual_seed(0)
@@ -270,11 +269,11 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
     data = transitions(stored)
     stored.extend(data)
     assert stored.replay_size == 5 * len(data)
-    assert isinstance(stored.augmentation, torch.nn.Identity)
+    assert [type(each) for each in stored.replay.transform] == [StoredCopies]
     sampled = build("sacfd_so2", "cnn")
     sampled.extend(data)
     assert sampled.replay_size == len(data)
-    assert not isinstance(sampled.augmentation, torch.nn.Identity)
+    assert [type(each) for each in sampled.replay.transform] == [SO2Augmentation]
 
 
 @pytest.mark.parametrize(

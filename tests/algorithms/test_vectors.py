@@ -42,7 +42,7 @@ def test_updates_and_actions_depend_on_the_vectors(network, vectors, algorithm, 
     learner = build(network, vectors, algorithm, **settings)
     data = tiny.transitions(learner)
     learner.extend(data)
-    sampled = learner.replay.sample()
+    sampled = learner.replay.storage[:]
     for key in vectors:  # stored without loss
         rows = (sampled[key][:, None] == data[key]).all(-1).nonzero()[:, 1]
         assert torch.equal(sampled[keys.NEXT, key], data[keys.NEXT, key][rows])
@@ -58,7 +58,7 @@ def test_updates_and_actions_depend_on_the_vectors(network, vectors, algorithm, 
 def test_the_contrastive_loss_does_not_compare_vectors():
     learner = build("ferm", ("proprio",), **tiny.FERM)
     learner.extend(tiny.transitions(learner))
-    batch = learner.augmentation(learner.replay.sample())
+    batch = learner.replay.sample()
     loss = learner.loss.contrastive_loss(batch)["loss_contrastive"]
     batch["proprio"] = batch["proprio"] + 5
     assert torch.equal(learner.loss.contrastive_loss(batch)["loss_contrastive"], loss)

@@ -5,7 +5,6 @@ import copy
 import pytest
 import torch
 from tensordict import TensorDict
-from torch import nn
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
@@ -177,26 +176,27 @@ def test_batches_are_augmented_with_the_configured_probability(name, probability
     made = build(name, batch_size=400, replay="uniform")
     made.extend(transitions(made))
     kind = SO2Augmentation if name == "sac" else RigidAugmentation
-    assert isinstance(made.augmentation, kind)
-    assert made.augmentation.probability == probability
+    (augmentation,) = made.replay.transform
+    assert isinstance(augmentation, kind)
+    assert augmentation.probability == probability
     twin = copy.deepcopy(made.replay._rng)
-    original = made.replay.sample()
+    original = made.replay.storage[made.replay.sample()["index"]]
     made.replay.set_rng(twin)
     is_moved = (made.sample()[keys.ACTION] != original[keys.ACTION]).any(dim=1).float().mean()
     assert 0.4 * probability < float(is_moved) < 1.3 * probability
     # an update learns from the augmented batch
     seen = []
-    made.augmentation.register_forward_hook(lambda _, __, out: seen.append(out))
+    augmentation.register_forward_hook(lambda _, __, out: seen.append(out))
     made.loss.register_forward_pre_hook(lambda _, args: seen.append(args[0]))
     made.update()
     assert seen[0] is seen[1]
 
 
 def test_the_order_and_kind_of_rigid_transforms_are_the_configured_ones():
-    augmentation = build("spatial_q").augmentation
+    (augmentation,) = build("spatial_q").replay.transform
     assert (augmentation.transforms, augmentation.order) == ("cn", 6)
     plain = build("sac", augmentation="none", augmentation_probability=0.8)
-    assert isinstance(plain.augmentation, nn.Identity)
+    assert not len(plain.replay.transform)
 
 
 def test_weight_decay_applies_to_the_networks_and_not_to_the_temperature(algorithm):
@@ -286,7 +286,7 @@ def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
     generators = {"replay": spatial.replay._rng}
     if replay == "symmetric":
         generators = dict(spatial.replay.sampler.generators)
-    generators["augmentation"] = spatial.augmentation._generator
+    generators["augmentation"] = spatial.replay.transform[0]._generator
     generators["exploration"] = spatial.explorer.generator
     torch.manual_seed(spatial.problem.seed)
     draws = {name: tuple(torch.rand(4, generator=g).tolist()) for name, g in generators.items()}

@@ -3,14 +3,21 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
-from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, Uint8Images
+from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.make import make_replay
-from ba_torchrl.data.transfer import batch_to_device, decoded_on_device, to_device
+from ba_torchrl.data.transfer import batch_to_device, to_device
 from ba_torchrl.envs import keys
+from ba_torchrl.envs.images import ImageSpec
 
 CPU, META = torch.device("cpu"), torch.device("meta")
-CODECS = {keys.DEPTH: DepthQuantizer(0.4), "heights": HalfPrecision(0.4), "camera": Uint8Images()}
+IMAGES = {
+    keys.DEPTH: ImageSpec(1, 8, 0.4, storage="uint8"),
+    "heights": ImageSpec(1, 8, 0.4, storage="float16"),
+    "camera": ImageSpec(3, 8, 255, storage="exact", dtype=torch.uint8),
+}
+CODECS = make_codecs(IMAGES)
 
 
 def transitions(count=20):
@@ -37,19 +44,26 @@ def test_codes_decoded_after_the_copy_are_the_images_of_the_replay(kind):
     images, codes = samples
     assert codes[keys.DEPTH].dtype == torch.uint8
     assert images[keys.DEPTH].dtype == torch.float32
-    decoded = decoded_on_device(codes, CODECS, CPU)
+    kept = codes.clone()
+    decoded = ImageCodecs(IMAGES, device=CPU)(codes)
     assert set(decoded.keys(True, True)) == set(images.keys(True, True))
     for key in images.keys(True, True):
         torch.testing.assert_close(decoded[key], images[key], rtol=0, atol=0)
-    assert codes[keys.DEPTH].dtype == torch.uint8  # unchanged
+    stored = LazyTensorStorage(50)  # the codec is the replay's, and not the storage's
+    replay = ReplayBuffer(storage=stored, transform=ImageCodecs(IMAGES, [*IMAGES]))
+    data = transitions()
+    replay.extend(data)
+    assert data[keys.DEPTH].dtype == torch.float32
+    assert stored[:][keys.DEPTH].dtype == stored[:][keys.NEXT, "heights"].dtype == torch.uint8
+    assert (stored[:][keys.DEPTH][kept["index"]] == kept[keys.DEPTH]).all()
+    assert (replay[kept["index"]] == images.select(*data.keys())).all()
 
 
 def test_images_go_to_the_device_first_and_the_other_entries_last():
     batch = transitions()
     batch.update({keys.DEPTH: CODECS[keys.DEPTH].encode(batch[keys.DEPTH])})
-    codecs = {keys.DEPTH: CODECS[keys.DEPTH]}
     batch[keys.NEXT, keys.DEPTH] = batch[keys.DEPTH]
-    decoded = decoded_on_device(batch, codecs, META)
+    decoded = ImageCodecs({keys.DEPTH: IMAGES[keys.DEPTH]}, device=META)(batch)
     assert decoded[keys.DEPTH].device == decoded[keys.NEXT, keys.DEPTH].device == META
     assert decoded[keys.ACTION].device == CPU
     moved = batch_to_device(decoded, META)

@@ -13,11 +13,14 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
 
 import ba_torchrl
+from ba_torchrl.data import CenterCrop, ImageCodecs, RandomViews
 from ba_torchrl.envs import keys
+from ba_torchrl.errors import ConfigError
 
 TASKS = {"close_loop/block_reaching": {}, "open_loop/block_stacking": {"num_objects": 2}}
 
 OF_IMAGES = {
+    "CenterCrop of ours": lambda key: CenterCrop(9, [key], ["centre"]),
     "CatFrames": lambda key: tr.CatFrames(3, dim=-3, in_keys=[key]),
     "ClipTransform": lambda key: tr.ClipTransform(in_keys=[key], low=0.0, high=0.1),
     "DTypeCastTransform": lambda key: tr.DTypeCastTransform(
@@ -112,6 +115,24 @@ def check(env, transform):
 @pytest.mark.parametrize("name", OF_IMAGES)
 def test_images_can_be_transformed(pixel_env, name):
     check(pixel_env, OF_IMAGES[name](next(iter(pixel_env.images))))
+
+
+def test_a_codec_gives_the_images_of_the_replay(pixel_env):
+    codec = ImageCodecs(pixel_env.images)
+    env = check(pixel_env, codec)
+    key = next(iter(pixel_env.images))
+    exact, seen = pixel_env.reset(seed=1), env.reset(seed=1)
+    stored = codec.codecs[key].decode(codec.codecs[key].encode(exact[key]))
+    assert torch.equal(seen[key], stored)
+    assert not torch.equal(seen[key], exact[key])
+    assert torch.equal(seen["rgb"], exact["rgb"])
+    assert torch.equal(codec(seen.clone())[key], stored)  # no further change
+
+
+def test_a_transform_of_transitions_is_refused_by_name(pixel_env):
+    env = TransformedEnv(pixel_env, RandomViews(pixel_env.images, seed=0))
+    with pytest.raises(ConfigError, match=r"RandomViews .*: append it to a replay"):
+        env.reset()
 
 
 def test_rendered_pixels_leave_the_image_of_the_control_alone(pixel_env):

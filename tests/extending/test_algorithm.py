@@ -52,12 +52,12 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
 
 def test_overriding_one_method_replaces_one_part(additions):
     class Augmented(additions["behaviour_cloning"].BehaviourCloning):
-        def make_augmentation(self):
-            return SO2Augmentation(self.images, self.problem.actions.sequence, seed=0)
+        def make_transforms(self):
+            return [SO2Augmentation(self.images, self.problem.actions.sequence, seed=0)]
 
     config = ExperimentConfig.parse(RUN)
     learner = Augmented(config.algorithm_config, config.network_config, problem_of(config))
-    assert isinstance(learner.augmentation, SO2Augmentation)
+    assert isinstance(learner.replay.transform[0], SO2Augmentation)
     assert learner.target_updater is None
 
 

@@ -13,8 +13,9 @@ from torch import Tensor
 
 from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.so2 import (
-    SeededModule,
+    SeededTransform,
     copy_exact_quarters,
+    image_pairs,
     map_pairs,
     quarters_and_rotation,
     require_known_frames,
@@ -81,7 +82,7 @@ class ActionGrid(Protocol):
         which swaps the fingers, bool [B]."""
 
 
-class RigidAugmentation(SeededModule):
+class RigidAugmentation(SeededTransform):
     """Applies a random rigid transform to images, next images and one action of each transition.
 
     Images with the gripper's axes do not change, with two exceptions: a reflection reverses the
@@ -118,7 +119,7 @@ class RigidAugmentation(SeededModule):
         grid: ActionGrid | None = None,
         action_key: str = keys.ACTION,
     ) -> None:
-        super().__init__(seed)
+        super().__init__([*image_pairs(images), action_key], seed)
         if not 0 <= probability <= 1 or order < 1:
             raise ValueError(
                 f"probability must be in [0, 1] and order positive, got {probability}, {order}"

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
+from typing import NoReturn
 
 import torch
 import torch.nn.functional as F
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.envs import Transform
 
 from ba_torchrl._generators import seeded_generator
 from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.errors import ConfigError
 
 
 def quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -81,6 +85,11 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
     return turned / turned.abs().amax(dim=-1, keepdim=True).clamp_min(1)
 
 
+def image_pairs(images: Iterable[str]) -> list[NestedKey]:
+    """Return the keys of images and next images."""
+    return [nested for key in images for nested in (key, (keys.NEXT, key))]
+
+
 def map_pairs(
     tensordict: TensorDictBase, key: str, rows: Tensor, transform: Callable[[Tensor], Tensor]
 ) -> None:
@@ -115,19 +124,27 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
         )
 
 
-class SeededModule(nn.Module):
-    """A module with draws of its own, whose generator is a part of its state.
+class SeededTransform(Transform):
+    """A transform of sampled transitions with draws of its own, for a replay.
 
-    The generator is on the CPU for any device of the batch, so that the draws of a seed are the
-    same on all devices.
+    Its generator is a part of its state, which the replay saves, and on the CPU for any device of
+    the batch, so that the draws of a seed are the same on all devices.
 
     Args:
+        changed: keys of the entries that it changes; with those of the next observation.
         seed: of the draws.
     """
 
-    def __init__(self, seed: int) -> None:
-        super().__init__()
+    def __init__(self, changed: Iterable[NestedKey], seed: int) -> None:
+        changed = list(changed)
+        super().__init__(changed, changed)
         self._generator = seeded_generator(seed)
+
+    def _reset(self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase) -> NoReturn:
+        raise ConfigError(
+            f"{type(self).__name__} transforms an image together with the next one: append it to a "
+            "replay, not to an environment"
+        )
 
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, so that a checkpoint continues the same draws."""
@@ -138,7 +155,7 @@ class SeededModule(nn.Module):
         self._generator.set_state(state.cpu())
 
 
-class SO2Augmentation(SeededModule):
+class SO2Augmentation(SeededTransform):
     """Rotates images, next images and (dx, dy) of each transition by a random angle.
 
     The reference implementation stores four rotated copies with each transition; on sampled
@@ -165,14 +182,15 @@ class SO2Augmentation(SeededModule):
         seed: int,
         probability: float = 0.8,
     ) -> None:
-        super().__init__(seed)
         if not 0 <= probability <= 1:
             raise ValueError(f"probability must be in [0, 1], got {probability}")
         if not {"x", "y"} <= set(action_sequence):
             raise ValueError(f"the action {action_sequence!r} has no x and y to rotate")
         require_known_frames(images)
+        scene_images = [key for key, image in images.items() if image.frame == "scene"]
+        super().__init__([*image_pairs(scene_images), keys.ACTION], seed)
         self.probability = probability
-        self._scene_images = [key for key, image in images.items() if image.frame == "scene"]
+        self._scene_images = scene_images
         self._plane = [action_sequence.index("x"), action_sequence.index("y")]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -201,8 +219,8 @@ class SO2Augmentation(SeededModule):
         return out
 
 
-class StoredCopies(nn.Module):
-    """Adds augmented copies after each transition that enters the replay.
+class StoredCopies(Transform):
+    """Adds augmented copies after each transition that enters a replay.
 
     The reference implementation stores four rotated copies. They take five times the capacity and,
     in a prioritised replay, each copy has a priority of its own.
@@ -212,12 +230,16 @@ class StoredCopies(nn.Module):
         copies: number of copies of each transition.
     """
 
-    def __init__(self, transform: nn.Module, copies: int) -> None:
+    def __init__(self, transform: Transform, copies: int) -> None:
         super().__init__()
         self.transform = transform
         self.copies = copies
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return sampled transitions as they are."""
+        return tensordict
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return transitions [N] as [N (copies + 1)], each followed by its copies."""
         copies = [self.transform(tensordict) for _ in range(self.copies)]
         return torch.stack([tensordict, *copies], dim=1).flatten(0, 1)

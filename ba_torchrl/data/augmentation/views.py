@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
-from torch import Tensor, nn
+from tensordict.utils import NestedKey
+from torch import Tensor
+from torchrl.data import Composite
+from torchrl.envs import Transform
 
-from ba_torchrl.data.augmentation.so2 import SeededModule
+from ba_torchrl.data.augmentation.so2 import SeededTransform, image_pairs
+from ba_torchrl.data.replay.codecs import mapped_bounds
 from ba_torchrl.data.transfer import to_device
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
@@ -40,19 +44,36 @@ def take_views(images: Tensor, offsets: Tensor, size: int, padding: int = 0) -> 
     return images.movedim(1, -1)[batch, rows, columns].movedim(-1, 2)
 
 
-class CenterCrop(nn.Module):
-    """The central part of images, which the acting policy sees.
+class CenterCrop(Transform):
+    """The central part of images, which the acting policy sees; needs no torchvision.
 
     Args:
         size: rows and columns, pixels.
+        in_keys: images [..., H, W].
+        out_keys: their parts [..., size, size]; None to replace the images.
     """
 
-    def __init__(self, size: int) -> None:
-        super().__init__()
+    def __init__(
+        self,
+        size: int,
+        in_keys: Sequence[NestedKey],
+        out_keys: Sequence[NestedKey] | None = None,
+    ) -> None:
+        super().__init__(in_keys, in_keys if out_keys is None else out_keys)
         self.size = size
 
-    def forward(self, images: Tensor) -> Tensor:
-        """Return [..., size, size] of images [..., H, W]."""
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Return the specification with the parts."""
+        for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
+            observation_spec[out_key] = mapped_bounds(observation_spec[key], self._apply_transform)
+        return observation_spec
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def _apply_transform(self, images: Tensor) -> Tensor:
         row, column = ((length - self.size) // 2 for length in images.shape[-2:])
         return images[..., row : row + self.size, column : column + self.size]
 
@@ -77,7 +98,7 @@ def cropped_images(images: Mapping[str, ImageSpec], size: int) -> dict[str, Imag
     return {key: replace(image, size=size) for key, image in images.items()}
 
 
-class RandomViews(SeededModule):
+class RandomViews(SeededTransform):
     """Replaces the images of transitions by random views of them.
 
     With one view of the image and one of the next image, both have the same offset (RAD: Laskin et
@@ -113,11 +134,13 @@ class RandomViews(SeededModule):
         target_views: int = 1,
         has_positive: bool = False,
     ) -> None:
-        super().__init__(seed)
+        others = [keys.HOLDING, *vectors]
+        changed = image_pairs([*images, *others])
+        super().__init__(changed, seed)
         if min(views, target_views) < 1:
             raise ValueError(f"views must be positive, got {views} and {target_views}")
         self.sizes = {key: image.size if size is None else size for key, image in images.items()}
-        self.others = [keys.HOLDING, *vectors]
+        self.others = others
         """Keys of the entries of the observation that are the same in all views."""
         self.padding = padding
         self.views = views

@@ -1,22 +1,26 @@
-"""Codecs of images in the replay, which are also applied to the acting policy's images."""
+"""Codecs of images in the replay, and the transform that applies them elsewhere."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
 import torch
+from tensordict import TensorDictBase
 from torch import Tensor, nn
+from torchrl.data import Bounded, Composite
+from torchrl.envs import Transform
 
+from ba_torchrl.data.transfer import to_device
+from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
 
 
 class ImageCodec(Protocol):
     """Maps images to uint8 codes and back; equal images have equal codes.
 
-    Called as a module, it encodes and decodes an image, so that the acting policy sees the same
-    images as the replay returns.
+    Called as a module, it encodes and decodes an image.
     """
 
     def encode(self, image: Tensor) -> Tensor:
@@ -58,6 +62,80 @@ def _make_codec(key: str, image: ImageSpec) -> ImageCodec:
             f"image {key!r}: storage 'uint8' takes values from zero, not from {image.low:g}"
         )
     return DepthQuantizer(image.high)
+
+
+def mapped_bounds(spec: Bounded, transform: Callable[[Tensor], Tensor]) -> Bounded:
+    """Return the specification of transformed images, whose values keep their order."""
+    low, high = transform(spec.space.low), transform(spec.space.high)
+    return Bounded(low, high, dtype=low.dtype, device=spec.device)
+
+
+class ImageCodecs(Transform):
+    """Images as the replay returns them.
+
+    An image gets the values that it has after storage: in a `TransformedEnv`, whose policy then
+    sees what it learns from, in a replay, and called on an observation. Codes are decoded. In a
+    replay, the next images too.
+
+    Args:
+        images: declarations by key.
+        in_keys_inv: images that a replay encodes when it is extended. A `FrameStorage` encodes
+            them itself.
+        device: to which images are copied before they are decoded; None to leave them where they
+            are.
+
+    Raises:
+        ValueError: an image has values that its storage cannot represent.
+    """
+
+    def __init__(
+        self,
+        images: Mapping[str, ImageSpec],
+        in_keys_inv: Sequence[str] = (),
+        device: torch.device | None = None,
+    ) -> None:
+        super().__init__(list(images), list(images), list(in_keys_inv), list(in_keys_inv))
+        self.codecs = make_codecs(images)
+        self.device = device
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Replace images, and next images if there are any, by those of the replay."""
+        if self.device is not None:
+            tensordict.clear_device_()
+        return self._map(tensordict, self.in_keys, self._stored)
+
+    _call = forward
+
+    def _reset(
+        self, tensordict: TensorDictBase, tensordict_reset: TensorDictBase
+    ) -> TensorDictBase:
+        return self._call(tensordict_reset)
+
+    def _stored(self, codec: ImageCodec, image: Tensor) -> Tensor:
+        if self.device is not None:
+            image = to_device(image, self.device)
+        return codec.decode(image) if image.dtype == torch.uint8 else codec(image)
+
+    def _inv_call(self, tensordict: TensorDictBase) -> TensorDictBase:
+        return self._map(tensordict, self.in_keys_inv, lambda codec, image: codec.encode(image))
+
+    def _map(
+        self,
+        tensordict: TensorDictBase,
+        chosen: Sequence[str],
+        function: Callable[[ImageCodec, Tensor], Tensor],
+    ) -> TensorDictBase:
+        for key in chosen:
+            for nested in (key, (keys.NEXT, key)):
+                if nested == key or nested in tensordict.keys(True):
+                    tensordict.set(nested, function(self.codecs[key], tensordict[nested]))
+        return tensordict
+
+    def transform_observation_spec(self, observation_spec: Composite) -> Composite:
+        """Return the specification with the bounds of stored images."""
+        for key in self.in_keys:
+            observation_spec[key] = mapped_bounds(observation_spec[key], self.codecs[key])
+        return observation_spec
 
 
 class Uint8Images(nn.Module):

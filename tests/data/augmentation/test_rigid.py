@@ -13,7 +13,7 @@ from ba_torchrl.data.augmentation.rigid import (
 )
 from ba_torchrl.envs import keys
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
-from tests.specs import open_loop_images
+from tests.specs import from_replay, open_loop_images
 
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 SIZE = 32
@@ -102,9 +102,12 @@ def test_a_shift_by_whole_pixels_moves_rows_along_x():
 def test_the_action_follows_its_target_in_the_image(transforms, settings):
     places = [(0.45 + 0.01 * i, -0.06 + 0.012 * i) for i in range(10)] * 6
     data = batch(places)
-    out = augmentation(transforms, layout(), seed=0, **settings)(data)
+    out = from_replay(augmentation(transforms, layout(), seed=0, **settings), data)
     assert not torch.allclose(out["action"], data["action"])
-    for image, action in zip(out["heightmap"], out["action"], strict=True):
+    for image, following, action in zip(
+        out["heightmap"], out["next", "heightmap"], out["action"], strict=True
+    ):
+        assert torch.equal(image, following)
         x, y = centre_of(image)
         assert abs(x - action[1]) < 1e-3
         assert abs(y - action[2]) < 1e-3

@@ -6,6 +6,7 @@ import math
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from ba_torchrl.data.augmentation.so2 import (
     SO2Augmentation,
@@ -15,6 +16,7 @@ from ba_torchrl.data.augmentation.so2 import (
 )
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
+from tests.specs import from_replay
 
 IMAGES = {"depth": ImageSpec(1, 32, 0.4)}
 
@@ -126,7 +128,7 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
         data[keys.DEPTH][i, 0] = blob(dx, dy, 32)
         data[keys.NEXT, keys.DEPTH][i, 0] = blob(-dx, -dy, 32)
     shown = data.clone()
-    out = SO2Augmentation(IMAGES, sequence, seed=3, probability=1.0)(data)
+    out = from_replay(SO2Augmentation(IMAGES, sequence, seed=3, probability=1.0), data)
     assert (data == shown).all()  # the input is not changed
     moved = (out[keys.ACTION] - before[keys.ACTION]).abs()
     others = [i for i in range(len(sequence)) if i not in (x, y)]
@@ -191,7 +193,9 @@ def test_each_transition_is_followed_by_its_rotated_copies():
     data = batch(n=3)
     data["number"] = torch.arange(3)
     data[keys.ACTION] *= 0.5  # short enough never to leave the box
-    out = StoredCopies(rotation, 4)(data)
+    replay = ReplayBuffer(storage=LazyTensorStorage(20), transform=StoredCopies(rotation, 4))
+    replay.extend(data)
+    out = replay[:]
     assert out["number"].tolist() == [0] * 5 + [1] * 5 + [2] * 5
     assert len(out[keys.ACTION].unique(dim=0)) == 15  # each copy has an angle of its own
     for i in range(15):

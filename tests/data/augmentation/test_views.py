@@ -12,7 +12,7 @@ from ba_torchrl.data.augmentation.views import (
 )
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
-from tests.specs import close_loop_images
+from tests.specs import close_loop_images, from_replay
 
 SIZE = 10
 
@@ -93,7 +93,7 @@ def test_shifts_repeat_the_border():
 
 def test_a_crop_has_the_same_offset_in_image_and_next_image():
     data = batch()
-    out = RandomViews(close_loop_images(SIZE), size=7, seed=0)(data)
+    out = from_replay(RandomViews(close_loop_images(SIZE), size=7, seed=0), data)
     found = set()
     for i in range(len(data)):
         assert out[keys.DEPTH].shape == (6, 1, 7, 7)
@@ -117,7 +117,7 @@ def test_every_offset_occurs_and_no_other():
 
 def test_several_views_have_offsets_of_their_own():
     data = batch()
-    out = views(padding=2, views=3, target_views=2)(data)
+    out = from_replay(views(padding=2, views=3, target_views=2), data)
     assert out[keys.DEPTH].shape == (6, 3, 1, SIZE, SIZE)
     assert out[keys.NEXT, keys.DEPTH].shape == (6, 2, 1, SIZE, SIZE)
     different = 0
@@ -160,7 +160,7 @@ def test_the_centre_crop_is_in_the_middle(height, start):
     images = torch.rand(2, 3, 1, height, height)
     size = 128 if height > 100 else 64
     expected = images[..., start : start + size, start : start + size]
-    assert torch.equal(CenterCrop(size)(images), expected)
+    assert torch.equal(CenterCrop(size, ["depth"])(TensorDict(depth=images))["depth"], expected)
 
 
 def test_declarations_have_the_size_of_the_crop_and_small_images_are_refused():
