@@ -9,6 +9,7 @@ from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
     from ba_torchrl.config import EnvConfig, WorkerOptions
+    from ba_torchrl.envs.base import BulletArmEnv
     from ba_torchrl.envs.description import describe
     from ba_torchrl.envs.factory import make, make_vector_env
     from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 
 _MODULES = {
+    "BulletArmEnv": "envs.base",
     "EnvConfig": "config",
     "ResolvedEnv": "envs.settings",
     "WorkerOptions": "config",
@@ -29,6 +31,7 @@ _MODULES = {
 """Modules of the public names, imported at their first use: that of TorchRL takes seconds."""
 
 __all__ = [
+    "BulletArmEnv",
     "EnvConfig",
     "ResolvedEnv",
     "WorkerOptions",

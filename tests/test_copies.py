@@ -182,10 +182,6 @@ NOT_PICKLED = {
         partial(vector, start_method="fork"),
         "processes of a vector cannot be copied: copy one with parallel=False",
     ),
-    "state": (
-        lambda: started(PICKING).get_state(),
-        "is of one process.*copy or pickle the environment",
-    ),
     "scene": (lambda: started(PICKING).scene, "a world cannot be copied: copy the environment"),
 }
 NOT_SPAWNED = ("sampler", *(f"replay, {kind}" for kind in get_args(ReplayKind)))

@@ -211,7 +211,7 @@ def test_a_circle_between_files_is_found():
             "from ba_torchrl.algorithms.sac import SAC",
             "algorithms",
         ),
-        ("ba_torchrl.modules.cnn", "from ba_torchrl.envs.base import ManipulationEnv", "envs"),
+        ("ba_torchrl.modules.cnn", "from ba_torchrl.envs.base import BulletArmEnv", "envs"),
         ("ba_torchrl.modules.cnn", "from ba_torchrl.objectives.sac import Loss", "objectives"),
         ("ba_torchrl.objectives.sac", "from ba_torchrl.modules.cnn import CNN", "modules"),
         ("ba_torchrl.training.loop", "from ba_torchrl.modules.cnn import CNN", "modules"),

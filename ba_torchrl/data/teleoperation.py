@@ -15,7 +15,7 @@ from torchrl.envs.utils import step_mdp
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.data.episodes import is_success
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 
 Effect = Literal["p", "x", "y", "z", "r", "fine", "discard", "end"]
 
@@ -126,7 +126,7 @@ class KeyEvents:
         rate: reads per second, at most.
     """
 
-    def __init__(self, env: ManipulationEnv, rate: float) -> None:
+    def __init__(self, env: BulletArmEnv, rate: float) -> None:
         self._env = env
         self._period_s = 1 / rate
         self._last_s = 0.0
@@ -156,7 +156,7 @@ class KeyEvents:
 
 
 def record_demonstrations(
-    env: ManipulationEnv,
+    env: BulletArmEnv,
     events: Callable[[], Mapping[int, int]],
     episodes: int,
     *,

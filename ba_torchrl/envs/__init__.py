@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from ba_torchrl.envs import keys
-    from ba_torchrl.envs.base import ManipulationEnv
+    from ba_torchrl.envs.base import BulletArmEnv
     from ba_torchrl.envs.images import ImageSpec
 
-_MODULES = {"ImageSpec": "images", "ManipulationEnv": "base"}
+_MODULES = {"ImageSpec": "images", "BulletArmEnv": "base"}
 """Modules of the names, imported at their first use: that of TorchRL takes seconds."""
 
-__all__ = ["ImageSpec", "ManipulationEnv", "keys"]
+__all__ = ["BulletArmEnv", "ImageSpec", "keys"]
 
 
 def __getattr__(name: str) -> Any:

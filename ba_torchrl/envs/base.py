@@ -1,4 +1,4 @@
-"""ManipulationEnv: a task, a robot and a world as a TorchRL environment."""
+"""BulletArmEnv: a task, a robot and a world as a TorchRL environment."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any, ClassVar
 
 import numpy as np
 import torch
-from tensordict import TensorDict, TensorDictBase
+from tensordict import NonTensorData, TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
+from torchrl.envs.utils import _classproperty
 
 from ba_torchrl import _segment_tree
 from ba_torchrl.envs import keys
@@ -27,32 +28,60 @@ from ba_torchrl.envs.observations import (
 )
 from ba_torchrl.envs.rendering import WORKSPACE_VIEW, Direction, RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
-from ba_torchrl.envs.settings import ResolvedEnv
+from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
 from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
-from ba_torchrl.tasks.base import SCALE_STEP, Task
+from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits
 
 _segment_tree.install()  # for TorchRL's prioritised buffers of users
 
 
-class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
-    """A manipulation task as an unbatched TorchRL environment on the CPU.
+class _MadeByTask(type(EnvBase)):
+    """Metaclass: a call of `BulletArmEnv` makes an environment of the class of its task's control.
+
+    Its subclasses are called with a `ResolvedEnv`.
+    """
+
+    def __call__(
+        cls,
+        task: str | ResolvedEnv,
+        *,
+        device: torch.device | str | int | None = None,
+        **config: Any,
+    ) -> BulletArmEnv:
+        if cls is BulletArmEnv:
+            resolved = resolve_env(task, config)
+            env = CONTROLS[resolved.task_class.control](resolved)
+        else:
+            env = super().__call__(task, **config)
+        return env if device is None else env.to(device)
+
+
+class BulletArmEnv(ChecksPolicy, CopiesWithState, EnvBase, metaclass=_MadeByTask):
+    """A manipulation task as an unbatched TorchRL environment.
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any
     other episodes. Exceptions are tasks that continue with the objects of the previous episode.
 
     Args:
-        resolved: the task and the parameters of the environment.
+        task: one of `available_envs`, or what `resolve_env` returned.
+        device: of its TensorDicts, the CPU by default. The simulation is on the CPU.
+        config: fields of `ba_torchrl.config.EnvConfig`, such as ``robot="kuka"``, ``seed=0`` or
+            ``expert=True``.
 
     Raises:
-        ConfigError: the workspace does not suit the objects or the robot.
+        ConfigError: the task or a parameter is unknown, its value cannot be used, or the workspace
+            does not suit the objects or the robot.
     """
 
+    _supports_set_state = True
+
     def __init__(self, resolved: ResolvedEnv) -> None:
-        super().__init__(device="cpu", batch_size=[])
+        # a state of `get_state` may be that after the last step of an episode
+        super().__init__(device="cpu", batch_size=[], allow_done_after_reset=True)
         self.resolved = resolved
         self.task_id, self.task_class = resolved.task_id, resolved.task_class
         self.config = resolved.config
@@ -64,7 +93,6 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
         low, high = self.config.object_scale_range
         scales = np.arange(low, high + 1e-9, SCALE_STEP)
         self._episodes = Episodes(scales, self._build_scene, self._place_robot)
-        self._identity = object()
         self._observation: dict[str, torch.Tensor] = {}
         self._observations = enabled_observations(self.config, self.workspace)
         self._memory: dict[str, Any] = {}  # of observations; it is replaced, never modified
@@ -142,6 +170,11 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
 
     # -- public ------------------------------------------------------------------------------
 
+    @_classproperty
+    def available_envs(cls) -> list[str]:
+        """Ids of all tasks, those of plugins included."""
+        return list(TASKS)
+
     @property
     def scene(self) -> Scene:
         """The world, robot and task of the current episode.
@@ -202,19 +235,28 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
         """
         yield self.render(width, height)
 
-    def get_state(self) -> EnvState:
-        """Return the full state, for `set_state`.
+    def get_state(self) -> TensorDict:
+        """Return the full state, which ``reset(state, set_state=True)`` restores.
 
-        A state is valid in this process only and takes a few milliseconds. The steps after this
-        call and after `set_state` with its result are the same bit for bit; steps without this call
-        may differ from them in the last bits.
+        Where TorchRL passes no such entry, ``reset(set_state=True, state=state)`` does: in a
+        `TransformedEnv`, or with ``list_of_kwargs`` in a `ParallelEnv` with buffers.
+
+        It takes a few milliseconds, and is valid in every environment of the same task and
+        parameters but for the seed, in any process. The steps after this call and after that reset
+        are the same bit for bit; steps without this call may differ from them in the last bits.
+
+        Returns:
+            A TensorDict with the entry ``state``.
 
         Raises:
             SimulationError: the environment has not been reset.
         """
+        return TensorDict({keys.STATE: NonTensorData(self._get_state())}, [], device=self.device)
+
+    def _get_state(self) -> EnvState:
         scene = self.scene
         return EnvState(
-            owner=self._identity,
+            origin=self._origin,
             scale=self._episodes.scale(),
             scene=scene.get_state(),
             observation=self._observation,
@@ -226,22 +268,25 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
             progress=self._progress,
         )
 
-    def set_state(self, state: EnvState) -> TensorDict:
-        """Restore a state of this environment; the same actions then give the same steps.
+    @property
+    def _origin(self) -> tuple[type, str, dict[str, Any]]:
+        return type(self), self.task_id, self.config.model_dump(exclude={"seed", "render"})
 
-        Args:
-            state: from `get_state`.
-
-        Returns:
-            The entries of that state that `step` returns under "next", without the
-            reward.
+    def _set_state(self, tensordict: TensorDictBase | None) -> TensorDict:
+        """Restore a state and return its entries.
 
         Raises:
-            SimulationError: the state is of another environment, or of a world that was closed
-                after a fault.
+            ConfigError: there is none, or it is that of other parameters.
         """
-        if state.owner is not self._identity:
-            raise SimulationError("the state is of another environment")
+        if tensordict is None or keys.STATE not in tensordict.keys():  # noqa: SIM118
+            raise ConfigError(
+                f"reset(td, set_state=True) needs the entry {keys.STATE!r} of get_state(). Where "
+                "TorchRL drops it (TransformedEnv, ParallelEnv with buffers), use "
+                "reset(set_state=True, state=td)"
+            )
+        state: EnvState = tensordict[keys.STATE]
+        if state.origin != self._origin:
+            raise ConfigError("the state is of an environment with another task or parameters")
         self._episodes.restore(state.scale, state.scene)
         self._observation, self._memory = state.observation, state.memory
         self.base_seed, self._episode = state.base_seed, state.episode
@@ -274,8 +319,16 @@ class ManipulationEnv(ChecksPolicy, CopiesWithState, EnvBase):
         self._episode = 0
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **_: Any
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        seed: int | None = None,
+        set_state: bool = False,
+        state: TensorDictBase | None = None,
+        **_: Any,
     ) -> TensorDict:
+        if set_state:
+            return self._set_state(tensordict if state is None else state)
         if seed is not None:
             self._set_seed(seed)
         self._episode += 1

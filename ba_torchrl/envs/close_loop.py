@@ -11,7 +11,7 @@ from torchrl.data import Bounded
 from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.images import Frame, ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
@@ -28,7 +28,7 @@ HALF_TURN = (-math.pi / 2, math.pi / 2)
 
 
 @CONTROLS.register("close_loop")
-class CloseLoopEnv(RecordedPosition, ManipulationEnv):
+class CloseLoopEnv(RecordedPosition, BulletArmEnv):
     """A task under close-loop control (paper section 3.2, appendix A.2, G.2).
 
     An action moves the tool by at most `dpos` along each axis and turns it by at most `drot`,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from typing import Any, ClassVar
 
 import torch
@@ -20,8 +19,8 @@ class CopiesWithState:
     The copy is an environment of its own: it has another simulator, without a window, in the same
     state, so that the same actions give the same steps bit by bit in both. Copying saves the state
     of the original as `get_state` does, after which the actions no longer determine its position.
-    It takes as long as `make`; to look ahead in one environment, `get_state` and `set_state` are
-    faster.
+    It takes as long as `make`; to look ahead in one environment, `get_state` and
+    ``reset(state, set_state=True)`` are faster.
 
     Subclasses keep the arguments of the constructor. Of the attributes, those that
     `copied_attributes` names are copied.
@@ -48,9 +47,8 @@ class CopiesWithState:
     def __reduce__(self) -> tuple[Any, ...]:
         scene = None
         if self._episodes.scene is not None:
-            world = self.scene.world.portable_snapshot()  # of what `get_state` saves and restores
-            state = self.get_state()
-            scene = state.scale, dataclasses.replace(state.scene, world=world)
+            state = self._get_state()
+            scene = state.scale, state.scene
         attributes = {
             name: getattr(self, name)
             for cls in type(self).__mro__
@@ -72,7 +70,7 @@ def _make_copy(
     Args:
         cls: its class.
         resolved: its task and parameters.
-        scene: scale of the objects, and state with a portable snapshot; None without a scene.
+        scene: scale of the objects, and state; None without a scene.
         attributes: values of the attributes that `copied_attributes` names.
         device: of its TensorDicts.
     """

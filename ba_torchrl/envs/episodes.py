@@ -22,9 +22,10 @@ SETTLE_STEPS = 100
 
 @dataclass(frozen=True)
 class EnvState:
-    """The full state of an environment; see `ManipulationEnv.get_state`."""
+    """The full state of an environment; see `BulletArmEnv.get_state`."""
 
-    owner: object
+    origin: tuple[type, str, dict[str, Any]]
+    """Class, task and parameters of the environment."""
     scale: float
     scene: SceneState
     observation: dict[str, torch.Tensor]
@@ -36,7 +37,7 @@ class EnvState:
     progress: float
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
-        return self  # it never changes, and its snapshot is of one world
+        return self  # it never changes
 
 
 class Episodes:

@@ -11,31 +11,20 @@ from torchrl.envs import EnvBase
 from typing_extensions import Unpack
 
 from ba_torchrl.config import EnvKeywords, WorkerOptions, parse
-from ba_torchrl.envs.base import ManipulationEnv
-from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
+from ba_torchrl.envs.base import BulletArmEnv
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.envs.vector.make import make_vector, processes_save_time
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import module_names
 
 
 @overload
-def make(task: str | ResolvedEnv, **config: Unpack[EnvKeywords]) -> ManipulationEnv: ...
+def make(task: str | ResolvedEnv, **config: Unpack[EnvKeywords]) -> BulletArmEnv: ...
 @overload
-def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv: ...
-def make(task: str | ResolvedEnv, **config: Any) -> ManipulationEnv:
-    """Make a TorchRL environment.
-
-    Args:
-        task: one of `ba_torchrl.list_tasks`, or what `resolve_env` returned.
-        config: fields of `ba_torchrl.config.EnvConfig`, such as ``robot="kuka"``, ``seed=0`` or
-            ``expert=True``.
-
-    Raises:
-        ConfigError: the task or a parameter is unknown, its value cannot be used, or the workspace
-            does not suit the objects or the robot.
-    """
-    resolved = resolve_env(task, config)
-    return CONTROLS[resolved.task_class.control](resolved)
+def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv: ...
+def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv:
+    """Make a TorchRL environment: `BulletArmEnv` with the same arguments."""
+    return BulletArmEnv(task, **config)
 
 
 def make_vector_env(
@@ -44,7 +33,7 @@ def make_vector_env(
     *,
     workers: WorkerOptions | None = None,
     register_modules: Sequence[str | ModuleType] = (),
-    make: Callable[[ResolvedEnv], ManipulationEnv] = make,
+    make: Callable[[ResolvedEnv], BulletArmEnv] = make,
     **options: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.

@@ -14,7 +14,7 @@ from torchrl.data import Bounded
 from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
 from ba_torchrl.config import EnvConfig
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
@@ -34,7 +34,7 @@ HOME_TOLERANCE_RAD = 1e-6
 
 
 @CONTROLS.register("open_loop")
-class OpenLoopEnv(RecordedPosition, ManipulationEnv):
+class OpenLoopEnv(RecordedPosition, BulletArmEnv):
     """A task under open-loop control (paper section 3.2, appendix A.1, G.1).
 
     An action is a pose and a primitive. A pick with an object in the gripper and a place without
@@ -171,7 +171,7 @@ class OpenLoopEnv(RecordedPosition, ManipulationEnv):
     def video_images(
         self, width: int, height: int, *, at_contact: bool = False
     ) -> Iterator[np.ndarray]:
-        """Yield the images of a video, which show the whole arm; see `ManipulationEnv`.
+        """Yield the images of a video, which show the whole arm; see `BulletArmEnv`.
 
         The simulation teleports the arm. These images show it move, by interpolation of its joints,
         to the grasp or the release of the action and back.

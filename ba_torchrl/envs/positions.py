@@ -21,7 +21,7 @@ class RecordedPosition:
     """Mix-in of environments: records the actions, and continues from a recorded position.
 
     The episode is played again with the same actions, which gives the same bits in any process.
-    Reading the position does not affect the simulation, unlike `ManipulationEnv.get_state`.
+    Reading the position does not affect the simulation, unlike `BulletArmEnv.get_state`.
     """
 
     copied_attributes = ("_first_episode", "_played", "_resumed")
@@ -65,23 +65,26 @@ class RecordedPosition:
                 self._step(TensorDict({keys.ACTION: torch.from_numpy(action.copy())}, []))
         self._resumed = self._tensordict(self._observation)
 
-    def get_state(self) -> Any:
-        """As `ManipulationEnv.get_state`, after which the position is unknown."""
+    def _get_state(self) -> Any:
         self._played = None
-        return super().get_state()
-
-    def set_state(self, state: Any) -> TensorDict:
-        """As `ManipulationEnv.set_state`, after which the position is unknown."""
-        self._played = None
-        return super().set_state(state)
+        return super()._get_state()
 
     def _set_seed(self, seed: int | None) -> None:
         super()._set_seed(seed)
         self._first_episode, self._played, self._resumed = 0, [], None
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **options: Any
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        seed: int | None = None,
+        set_state: bool = False,
+        **options: Any,
     ) -> TensorDict:
+        if set_state:
+            restored = super()._reset(tensordict, set_state=True, **options)
+            self._played = self._resumed = None
+            return restored
         if self._resumed is not None and seed is None:
             resumed, self._resumed = self._resumed, None
             return resumed
@@ -102,5 +105,5 @@ class RecordedPosition:
         if self.faults > faults:  # the next episode is in a new world
             self._first_episode, self._played = self._episode, []
         elif self._played is not None:
-            self._played[-1].append(tensordict.get(keys.ACTION).detach().clone())
+            self._played[-1].append(tensordict.get(keys.ACTION).detach().cpu().clone())
         return result

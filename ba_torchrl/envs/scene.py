@@ -13,7 +13,7 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.sim.world import FINE_PHYSICS, Physics, PortableSnapshot, Snapshot, World
+from ba_torchrl.sim.world import FINE_PHYSICS, Physics, Snapshot, World
 from ba_torchrl.tasks.base import Task, TaskSettings
 from ba_torchrl.tasks.terrain.tray import Tray
 from ba_torchrl.tasks.workspace import Workspace
@@ -40,7 +40,7 @@ class Controller(Protocol):
 class SceneState:
     """The full state of a scene."""
 
-    world: Snapshot | PortableSnapshot
+    world: Snapshot
     robot: Any
     controller: Any
     task: Any
@@ -74,11 +74,7 @@ class Scene:
         )
 
     def set_state(self, state: SceneState) -> None:
-        """Restore a state of this scene.
-
-        Raises:
-            SimulationError: the state is of another scene.
-        """
+        """Restore a state of this scene, or of one with the same bodies."""
         self.world.restore(state.world)
         self.task.terrain.set_state(state.terrain)
         self.task.set_state(state.task)

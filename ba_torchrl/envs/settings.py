@@ -18,7 +18,7 @@ from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 
 class Control(Protocol):
-    """What the class of environments of a control declares besides `ManipulationEnv`."""
+    """What the class of environments of a control declares besides `BulletArmEnv`."""
 
     default_action_sequence: ClassVar[str]
     """Default `action_sequence`."""

@@ -14,7 +14,7 @@ from ba_torchrl.data.files import replaced
 from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
 
 if TYPE_CHECKING:
-    from ba_torchrl.envs.base import ManipulationEnv
+    from ba_torchrl.envs.base import BulletArmEnv
 
 _SUFFIXES = (".mp4", ".gif")
 MIN_FPS, MAX_FPS = 1, 240
@@ -42,7 +42,7 @@ class FrameRecorder:
     """
 
     def __init__(
-        self, env: ManipulationEnv, width: int = 400, height: int = 400, *, motion: bool = False
+        self, env: BulletArmEnv, width: int = 400, height: int = 400, *, motion: bool = False
     ) -> None:
         self.env = env
         self.motion = motion

@@ -25,46 +25,33 @@ from ba_torchrl.sim.shapes import Color, Shape
 
 
 class Snapshot:
-    """A state of a world in PyBullet's memory, freed when this object is deleted.
+    """A state of a world, for worlds with the same bodies in this or another process.
 
-    The connection is the finalizer of the world that owns the client.
+    It is in bytes and, to restore the world that it is of in less time, in PyBullet's memory, which
+    is freed when this object is deleted. The connection is the finalizer of that world.
     """
 
+    connection: weakref.finalize | None = None
+
     def __init__(self, client: int, connection: weakref.finalize) -> None:
-        self.client = client
+        with _temporary_file() as path:
+            pybullet.saveBullet(path, physicsClientId=client)
+            self.content = Path(path).read_bytes()
         self.connection = connection
         self.id = pybullet.saveState(physicsClientId=client)
         weakref.finalize(self, _remove_state, self.id, client, connection)
 
-    def load(self, client: int) -> None:
-        """Load the state into the client that it is of."""
-        pybullet.restoreState(self.id, physicsClientId=client)
-
-    def __reduce__(self) -> NoReturn:
-        raise TypeError(
-            "a state of get_state is of one process and needs no copy, since it never changes; to "
-            "keep or send the state of an environment, copy or pickle the environment"
-        )
-
-
-@dataclass(frozen=True)
-class PortableSnapshot:
-    """A state of a world as bytes, for worlds with the same bodies in this or another process."""
-
-    content: bytes
-
-    @classmethod
-    def of(cls, client: int) -> Self:
-        """Return the present state of a client."""
-        with _temporary_file() as path:
-            pybullet.saveBullet(path, physicsClientId=client)
-            return cls(Path(path).read_bytes())
-
-    def load(self, client: int) -> None:
-        """Load the state into a client with the same bodies."""
+    def load(self, client: int, connection: weakref.finalize) -> None:
+        """Load the state into a client, whose world has this connection."""
+        if connection is self.connection:  # PyBullet reuses client ids
+            pybullet.restoreState(self.id, physicsClientId=client)
+            return
         with _temporary_file() as path:
             Path(path).write_bytes(self.content)
             pybullet.restoreState(fileName=path, physicsClientId=client)
+
+    def __getstate__(self) -> dict[str, bytes]:
+        return {"content": self.content}
 
 
 @contextlib.contextmanager
@@ -231,7 +218,7 @@ class World:
         self.restore(self._pristine)
 
     def snapshot(self) -> Snapshot:
-        """Save the state of every body and contact in memory, for `restore`.
+        """Save the state of every body and contact, for `restore`.
 
         The snapshot is also restored at once, which clears the internal caches of the engine that
         no snapshot contains. The trajectory from here therefore equals that after each `restore`.
@@ -240,32 +227,24 @@ class World:
         self.restore(snapshot)
         return snapshot
 
-    def portable_snapshot(self) -> PortableSnapshot:
-        """Return the present state in a form that another world with the same bodies can restore.
-
-        The trajectory of that world equals the one of this world after a `snapshot` that follows.
-        """
-        return PortableSnapshot.of(self.client)
-
-    def restore(self, snapshot: Snapshot | PortableSnapshot) -> None:
+    def restore(self, snapshot: Snapshot) -> None:
         """Restore a snapshot; the caller must repeat the motor commands.
 
+        Args:
+            snapshot: of this world, or of another with the same bodies.
+
         Raises:
-            SimulationError: the snapshot belongs to another or a closed world.
+            SimulationError: this world is closed.
             RuntimeError: within `fixed_poses`.
         """
         self._check_not_fixed()
-        # PyBullet reuses client ids, so that the connection identifies the world
-        is_foreign = isinstance(snapshot, Snapshot) and snapshot.connection is not self._disconnect
-        if is_foreign or self.is_closed:
-            raise SimulationError(
-                "the snapshot belongs to another world: its own was closed or rebuilt"
-            )
+        if self.is_closed:
+            raise SimulationError("the world is closed")
         self._wake_all()
         # the first call restores the poses at which the pairs are rebuilt, the second all the rest
-        snapshot.load(self.client)
+        snapshot.load(self.client, self._disconnect)
         self._rebuild_collision_pairs()
-        snapshot.load(self.client)
+        snapshot.load(self.client, self._disconnect)
         for body in self.bodies:
             body.apply_activity()
 

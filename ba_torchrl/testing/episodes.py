@@ -11,7 +11,7 @@ from tensordict import TensorDict, TensorDictBase
 
 from ba_torchrl import make
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.tasks.base import TASKS, Task
 
 IMAGE_SIZES = {"close_loop": 32, "open_loop": 128}
@@ -24,7 +24,7 @@ RANDOM_STEPS = {"close_loop": 8, "open_loop": 2}
 """Number of random actions that disturb a scene, by control."""
 
 
-def make_small(task: str, **config: Any) -> ManipulationEnv:
+def make_small(task: str, **config: Any) -> BulletArmEnv:
     """Make an environment with seed 0 and a small image."""
     size = IMAGE_SIZES[TASKS[task].control]
     return make(task, **{"obs_size": size, "seed": 0, **config})
@@ -45,7 +45,7 @@ def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
     return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
 
 
-def play_expert(env: ManipulationEnv, episodes: int, *, noise: float = 0.0) -> list[TensorDict]:
+def play_expert(env: BulletArmEnv, episodes: int, *, noise: float = 0.0) -> list[TensorDict]:
     """Return episodes [T] of the expert.
 
     Args:
@@ -68,7 +68,7 @@ def play_expert(env: ManipulationEnv, episodes: int, *, noise: float = 0.0) -> l
     ]
 
 
-def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
+def action_at(env: BulletArmEnv, fractions: Sequence[float]) -> torch.Tensor:
     """Return the action at fractions, 0 to 1, of the components' ranges; they are cycled."""
     low, high = env.action_spec.space.low, env.action_spec.space.high
     place = torch.tensor([fractions[i % len(fractions)] for i in range(len(low))]).to(low)
@@ -76,7 +76,7 @@ def action_at(env: ManipulationEnv, fractions: Sequence[float]) -> torch.Tensor:
 
 
 def random_actions(
-    env: ManipulationEnv, state: TensorDictBase, rng: np.random.Generator
+    env: BulletArmEnv, state: TensorDictBase, rng: np.random.Generator
 ) -> TensorDictBase:
     """Take random actions and return the entries of the last step, which may be done."""
     for _ in range(RANDOM_STEPS[env.task_class.control]):

@@ -11,7 +11,7 @@ import numpy as np
 from tensordict import TensorDictBase
 
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import Quaternion, yaw_quaternion
@@ -102,7 +102,7 @@ class Disturbed(NamedTuple):
         ]
 
 
-Disturb = Callable[[ManipulationEnv, TensorDictBase, np.random.Generator], TensorDictBase]
+Disturb = Callable[[BulletArmEnv, TensorDictBase, np.random.Generator], TensorDictBase]
 
 
 def check_progress(
@@ -134,7 +134,7 @@ def check_progress(
             )
 
 
-def play_disturbed(env: ManipulationEnv, seed: int, disturb: Disturb) -> Disturbed | None:
+def play_disturbed(env: BulletArmEnv, seed: int, disturb: Disturb) -> Disturbed | None:
     """Return the expert's steps from a disturbed scene; None if the disturbance ends the episode.
 
     The seed is that of the episode and of the disturbance.
@@ -177,7 +177,7 @@ def _check_repetitions(played: Disturbed, where: str) -> None:
 
 
 def close_around_object(
-    env: ManipulationEnv, state: TensorDictBase, rng: np.random.Generator
+    env: BulletArmEnv, state: TensorDictBase, rng: np.random.Generator
 ) -> TensorDictBase:
     """Close the fingers around a random object, then move at random with closed fingers."""
     scene, gripper = env.scene, env.scene.robot.gripper
@@ -202,7 +202,7 @@ def close_around_object(
 
 
 def drop_object(
-    env: ManipulationEnv, state: TensorDictBase, rng: np.random.Generator
+    env: BulletArmEnv, state: TensorDictBase, rng: np.random.Generator
 ) -> TensorDictBase:
     """Drop a random object at a random pose, often flush with another body."""
     scene = env.scene
@@ -226,7 +226,7 @@ def drop_object(
 
 
 def _random_place(
-    env: ManipulationEnv, body: Body, rng: np.random.Generator
+    env: BulletArmEnv, body: Body, rng: np.random.Generator
 ) -> tuple[tuple[float, float], float]:
     """Return a random position and yaw of a body, often flush with a side of another body."""
     others = [

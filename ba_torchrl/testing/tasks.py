@@ -21,7 +21,7 @@ from torchrl.envs.utils import check_env_specs
 
 from ba_torchrl import make, make_vector_env
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.testing.episodes import (
     MAX_EPISODE_STEPS,
@@ -370,11 +370,11 @@ CHECKS = (
 # -- parts -----------------------------------------------------------------------------------
 
 
-def _constant_policy(env: ManipulationEnv, *fractions: float) -> Policy:
+def _constant_policy(env: BulletArmEnv, *fractions: float) -> Policy:
     return lambda td: td.set(keys.ACTION, action_at(env, fractions))
 
 
-def _recover(env: ManipulationEnv, seed: int) -> bool | None:
+def _recover(env: BulletArmEnv, seed: int) -> bool | None:
     """Return the expert's success after random actions; None if these end the episode."""
     state = random_actions(env, env.reset(seed=seed), np.random.default_rng(seed))
     if state[keys.DONE]:

@@ -28,7 +28,7 @@ from ba_torchrl.algorithms.base import Learner, SeedUse
 from ba_torchrl.config import StrictModel, explain
 from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, known_names
@@ -146,7 +146,7 @@ class TrainedPolicy(TensorDictModuleBase):
         """Seed of episodes that training did not use."""
         return self.config.derived_seed(SeedUse.TEST)
 
-    def make_env(self, **changes: Any) -> ManipulationEnv:
+    def make_env(self, **changes: Any) -> BulletArmEnv:
         """Make the environment that the policy was trained in.
 
         Args:

@@ -61,7 +61,7 @@ def test_conditions_are_those_of_a_restored_state():
     env.reset()
     before, state = env.conditions, env.get_state()
     env.step(env.reset().set(keys.ACTION, torch.zeros(5)))
-    env.set_state(state)
+    env.reset(state, set_state=True)
     assert env.conditions == before
     env.close()
 

@@ -217,7 +217,7 @@ def test_an_instruction_follows_the_parameters_and_the_episode(make):
         assert state[keys.SUCCESS]
         state = heap.reset()
     assert told == ["pick up one of the two objects in the tray", "pick up the object in the tray"]
-    assert heap.set_state(saved)["instruction"] == heap.instruction == told[0]
+    assert heap.reset(saved, set_state=True)["instruction"] == heap.instruction == told[0]
 
 
 def test_gymnasium_has_the_instruction_in_info():

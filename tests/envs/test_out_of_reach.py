@@ -26,7 +26,7 @@ def test_a_pick_through_the_floor_has_no_effect_and_is_told(fast_mode):
     saved = env.get_state()
     env.step(state.clone().set(keys.ACTION, torch.tensor(VERTICAL)))
     assert not env.is_out_of_reach
-    env.set_state(saved)
+    env.reset(saved, set_state=True)
     assert env.is_out_of_reach
     env.reset()
     assert not env.is_out_of_reach

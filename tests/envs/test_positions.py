@@ -126,7 +126,7 @@ def test_a_position_that_the_actions_do_not_determine_is_refused():
         env.get_position()
     env.reset()
     assert len(env.get_position()["actions"][0]) == 0
-    env.set_state(state)
+    env.reset(state, set_state=True)
     with pytest.raises(SimulationError, match="do not determine"):
         env.get_position()
     env.close()

@@ -1,4 +1,4 @@
-"""`ManipulationEnv.render`: the workspace fills the image and shows the arm and the held object."""
+"""`BulletArmEnv.render`: the workspace fills the image and shows the arm and the held object."""
 
 import itertools
 import math

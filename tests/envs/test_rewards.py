@@ -205,7 +205,7 @@ def test_states_and_copies_keep_the_progress(make):
     expected = env.step(action.clone())[keys.NEXT, keys.REWARD]
     assert expected.item() > 0.01
     env.step(env.reset(seed=7).set(keys.ACTION, torch.zeros(5)))
-    env.set_state(saved)
+    env.reset(saved, set_state=True)
     assert env.step(action.clone())[keys.NEXT, keys.REWARD] == expected
     assert other.step(action.clone())[keys.NEXT, keys.REWARD] == expected
     other.close()

@@ -1,17 +1,21 @@
-"""get_state and set_state: the same state and the same actions give the same steps."""
+"""get_state and reset(set_state=True): the same state and actions give the same steps."""
 
 import copy
 import pickle
 import subprocess
 import sys
+from functools import partial
 
 import gymnasium
 import pybullet
 import pytest
 import torch
+from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 import ba_torchrl
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.make import make_vector
+from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.testing.episodes import image_of
 from tests.specs import slow_except
 
@@ -62,10 +66,11 @@ def test_a_state_and_its_actions_determine_the_steps(task):
         drawn = torch.rand(12, len(low), generator=generator) * (high - low) + low
         actions, others = drawn[:6], drawn[6:]
         first = play(env, state, actions)
-        returned = env.set_state(kept)
-        assert (returned == state.select(*returned.keys())).all()
+        returned = env.reset(kept, set_state=True)
+        assert returned is kept
+        assert (returned.exclude("state") == state.select(*returned.keys(), strict=False)).all()
         away = play(env, returned, others)
-        second = play(env, env.set_state(kept), actions)
+        second = play(env, env.reset(kept, set_state=True), actions)
         assert same(first, second)
         assert not same(first, away)
     env.close()
@@ -111,7 +116,7 @@ def test_states_and_episodes_do_not_depend_on_earlier_motion(task, seed):
     expert_steps(env, state, seed)
     kept, futures = env.get_state(), []
     for away in (0, 7, 3):
-        futures.append(future(env.set_state(kept)))
+        futures.append(future(env.reset(kept, set_state=True)))
         expert_steps(env, env.reset(), away)
     assert futures[0] == futures[1] == futures[2]
     env.set_seed(seed)
@@ -127,7 +132,7 @@ def test_a_state_of_a_heap_survives_another_seed(task):
     kept = env.get_state()
     env.set_seed(1)
     assert not torch.equal(image_of(env.reset()), first)
-    assert torch.equal(image_of(env.set_state(kept)), first)
+    assert torch.equal(image_of(env.reset(kept, set_state=True)), first)
     env.close()
 
 
@@ -139,7 +144,7 @@ def test_an_action_can_be_undone_by_restoring_the_state():
         kept = tried.get_state()
         plain.get_state()  # keeping a state is itself felt in the last bits
         tried.step(a.clone().set("action", torch.tensor([-1.0, 0.3, -0.8, -1.0, 0.5])))
-        a = tried.set_state(kept)
+        a = tried.reset(kept, set_state=True)
         a = tried.step(a.set("action", a["expert_action"]))["next"]
         b = plain.step(b.set("action", b["expert_action"]))["next"]
         assert (a == b).all()
@@ -154,7 +159,7 @@ def test_a_state_keeps_how_its_episode_ended():
     last = env.step(env.reset().set("action", torch.zeros(5)))["next"]
     kept = env.get_state()
     env.reset()
-    returned = env.set_state(kept)
+    returned = env.reset(kept, set_state=True)
     assert last["truncated"]
     assert returned["truncated"]
     assert returned["done"]
@@ -162,15 +167,107 @@ def test_a_state_keeps_how_its_episode_ended():
     env.close()
 
 
-def test_a_state_of_another_environment_is_refused():
-    first, second = (ba_torchrl.make("close_loop/block_picking", obs_size=32) for _ in range(2))
-    first.reset()
-    with pytest.raises(SimulationError, match="another environment"):
-        second.set_state(first.get_state())
-    with pytest.raises(SimulationError, match="reset"):
-        second.get_state()
+def test_another_environment_and_a_new_world_continue_a_state():
+    first, second = (
+        ba_torchrl.make("close_loop/object_grasping", obs_size=32, seed=seed) for seed in (0, 1)
+    )
+    first.step(first.reset().set("action", torch.full((5,), -0.5)))
+    kept, actions = first.get_state(), torch.tensor([[1.0, 0.5, 0.0, -1.0, 0.3]] * 4)
+    there = pickle.loads(pickle.dumps(kept))
+    expected = play(first, first.reset(kept.clone(), set_state=True), actions)
+    assert same(play(second, second.reset(there, set_state=True), actions), expected)
+    assert torch.equal(first.reset()["depth"], second.reset()["depth"])
+    state = first.reset().set("action", torch.zeros(5))
+    pybullet.disconnect(physicsClientId=first.scene.world.client)
+    assert first.step(state)["next", "fault"]
+    assert same(play(first, first.reset(kept, set_state=True), actions), expected)
     first.close()
     second.close()
+
+
+def test_a_reset_to_no_state_of_these_parameters_is_refused():
+    env = ba_torchrl.make("close_loop/block_picking", obs_size=32)
+    other = ba_torchrl.make("close_loop/block_picking", obs_size=16)
+    with pytest.raises(SimulationError, match="reset"):
+        env.get_state()
+    state = env.reset()
+    for given in (None, state):
+        with pytest.raises(ConfigError, match="needs the entry 'state'"):
+            env.reset(given, set_state=True)
+    with pytest.raises(ConfigError, match="another task or parameters"):
+        other.reset(env.get_state(), set_state=True)
+    kept = env.get_state()
+    first = env.step(kept.clone().set("action", torch.full((5,), -0.5)))["next", "depth"]
+    assert not torch.equal(env.reset(kept)["depth"], first)  # a new episode
+    assert env._episode == 2
+    env.close()
+    other.close()
+
+
+STEP = torch.tensor([[1.0, 0.3, 0.0, -1.0, 0.0], [-1.0, 0.0, 0.0, -0.5, 0.5]])
+VECTORS = {
+    "SerialEnv": partial(SerialEnv, 2),
+    "SerialEnv, without buffers": partial(SerialEnv, 2, use_buffers=False),
+    "ParallelEnv, without buffers": partial(
+        ParallelEnv, 2, use_buffers=False, mp_start_method="fork"
+    ),
+    "one process": partial(make_vector, num_envs=2, workers=WorkerOptions(parallel=False)),
+    "processes": partial(make_vector, num_envs=2, workers=WorkerOptions(start_method="fork")),
+}
+
+
+@pytest.mark.parametrize("name", VECTORS)
+def test_a_vector_restores_the_states_of_its_environments(name):
+    make = partial(ba_torchrl.BulletArmEnv, "close_loop/block_picking", obs_size=16)
+    vector = VECTORS[name]([partial(make, seed=seed) for seed in (0, 1)])
+    try:
+        state = vector.reset()
+        kept = vector.get_state()
+        kept = torch.stack(kept() if callable(kept) else kept) if isinstance(kept, list) else kept
+        first = vector.step(state.clone().set("action", STEP))["next"].clone()
+        state = vector.reset(kept.clone(), set_state=True)
+        second = vector.step(state.set("action", STEP))["next"].clone()
+        assert set(first.keys()) == set(second.keys())
+        assert all(torch.equal(first[key], second[key]) for key in ("depth", "done", "reward"))
+        state = second.exclude("reward").set("_reset", torch.tensor([[True], [False]]))
+        state = vector.reset(state.update(kept), set_state=True)
+        assert state["step_count"].flatten().tolist() == [0, 1]
+        third = vector.step(state.set("action", STEP))["next"]
+        assert torch.equal(third["depth"][0], first["depth"][0])
+        assert third["step_count"].flatten().tolist() == [1, 2]
+    finally:
+        vector.close()
+
+
+@pytest.mark.parametrize(
+    "make_vector",
+    [
+        partial(ParallelEnv, 2, mp_start_method="fork"),
+        lambda makers: TransformedEnv(SerialEnv(2, makers), StepCounter(step_count_key="count")),
+        VECTORS["one process"],
+    ],
+    ids=["ParallelEnv", "TransformedEnv", "one process"],
+)
+def test_a_state_is_a_keyword_where_torchrl_passes_no_entry(make_vector):
+    make = partial(ba_torchrl.BulletArmEnv, "close_loop/block_picking", obs_size=16)
+    env, vector = make(seed=5), make_vector([partial(make, seed=seed) for seed in (0, 1)])
+    try:
+        kept = []
+        for _ in range(2):
+            env.reset()
+            kept.append(env.get_state())
+        first = [
+            env.step(env.reset(each.clone(), set_state=True).set("action", action))["next"]
+            for each, action in zip(kept, STEP, strict=True)
+        ]
+        state = vector.reset(set_state=True, list_of_kwargs=[{"state": each} for each in kept])
+        second = vector.step(state.set("action", STEP))["next"]
+        assert torch.equal(second["depth"], torch.stack(first)["depth"])
+        state = vector.reset(set_state=True, state=kept[0])
+        assert torch.equal(state["depth"][0], state["depth"][1])
+    finally:
+        vector.close()
+        env.close()
 
 
 def test_deleted_states_free_their_memory():
@@ -179,7 +276,7 @@ def test_deleted_states_free_their_memory():
     env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
     env.reset()
     kept = env.get_state()
-    number, client = kept.scene.world.id, env.scene.world.client
+    number, client = kept["state"].scene.world.id, env.scene.world.client
     del kept
     with pytest.raises(pybullet.error):
         pybullet.restoreState(number, physicsClientId=client)
@@ -349,8 +446,6 @@ def test_parts_of_an_environment_cannot_be_copied():
         for make_copy in (copy.deepcopy, pickle.dumps):
             with pytest.raises(TypeError, match="copy the environment"):
                 make_copy(part)
-    with pytest.raises(TypeError, match="of one process"):
-        pickle.dumps(state)
     env.step(env.reset().set("action", torch.zeros(5)))
-    assert torch.equal(env.set_state(state)["depth"], depth)
+    assert torch.equal(env.reset(state, set_state=True)["depth"], depth)
     env.close()

@@ -116,7 +116,7 @@ def test_the_random_parts_of_a_terrain_belong_to_the_episode_and_its_state(start
         assert float(state[keys.HEIGHTMAP].min()) == pytest.approx(heights[-1], abs=1e-6)
         kept, state = env.get_state(), env.reset()
     assert len(set(heights)) == 3
-    env.set_state(kept)
+    env.reset(kept, set_state=True)
     assert terrain.height_m((0.0, 0.0)) == heights[-1]
 
 
@@ -129,7 +129,7 @@ def test_the_variants_of_a_close_loop_structure_belong_to_its_state(started):
         env.reset()
         drawn.append([body.id for body in task.objects])
     assert any(ids != before for ids in drawn)
-    env.set_state(state)
+    env.reset(state, set_state=True)
     assert [body.id for body in task.objects] == before
 
 

@@ -5,7 +5,7 @@ import torch
 from tqdm import tqdm
 
 import ba_torchrl
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.vision import depth
 from profiling import simulation, throughput
@@ -91,9 +91,9 @@ def test_the_physics_of_a_step_is_a_part_of_it(monkeypatch):
 def test_resets_with_a_seed_are_timed(monkeypatch):
     monkeypatch.setattr(simulation, "list_tasks", lambda: ["close_loop/object_grasping"])
     seeds = []
-    reset = ManipulationEnv.reset
+    reset = BulletArmEnv.reset
     monkeypatch.setattr(
-        ManipulationEnv,
+        BulletArmEnv,
         "reset",
         lambda self, *args, **named: seeds.append(named["seed"]) or reset(self, *args, **named),
     )

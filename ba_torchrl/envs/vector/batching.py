@@ -38,9 +38,12 @@ class Vector(ChecksPolicy, EnvBase):
         for make_env in dict.fromkeys(create_env_fn):
             env = make_env()
             specs[make_env], description = env.specs.clone().to("cpu"), repr(env)
+            supports_set_state = env._supports_set_state
             env.close(raise_if_closed=False)
         stacked = torch.stack([specs[make_env] for make_env in create_env_fn])
-        super().__init__(device="cpu", batch_size=stacked.shape)
+        super().__init__(
+            device="cpu", batch_size=stacked.shape, allow_done_after_reset=supports_set_state
+        )
         self.num_workers, self.create_env_fn = num_workers, list(create_env_fn)
         self.observation_spec = stacked["output_spec", "full_observation_spec"]
         self.reward_spec = stacked["output_spec", "full_reward_spec"]
@@ -48,7 +51,7 @@ class Vector(ChecksPolicy, EnvBase):
         self.state_spec = stacked["input_spec", "full_state_spec"]
         self.action_spec = stacked["input_spec", "full_action_spec"]
         self._base_seed: int | None = None
-        self._description = description
+        self._description, self._supports_set_state = description, supports_set_state
 
     # -- for subclasses ----------------------------------------------------------------------
 
@@ -94,6 +97,10 @@ class Vector(ChecksPolicy, EnvBase):
         """Return an attribute of each environment, and whether it is a method."""
 
     # -- public ------------------------------------------------------------------------------
+
+    def get_state(self) -> TensorDict:
+        """Return the state of each environment, for ``reset(state, set_state=True)``."""
+        return torch.stack(self._call_each("get_state", [()] * self.num_workers))
 
     def set_seed(self, seed: int | None = None, static_seed: bool = False) -> int | None:
         """Seed the environments as TorchRL's batched environments are.
@@ -172,7 +179,12 @@ class Vector(ChecksPolicy, EnvBase):
         raise NotImplementedError  # `set_seed` does it
 
     def _reset(
-        self, tensordict: TensorDictBase | None = None, *, seed: int | None = None, **kwargs: Any
+        self,
+        tensordict: TensorDictBase | None = None,
+        *,
+        seed: int | None = None,
+        set_state: bool = False,
+        **kwargs: Any,
     ) -> TensorDictBase:
         each = kwargs.pop("list_of_kwargs", [{}] * self.num_workers)
         options = [{**kwargs, **own} for own in each]
@@ -180,6 +192,13 @@ class Vector(ChecksPolicy, EnvBase):
             check_seed(seed)
             self._base_seed = int(seed)
             options = [{**own, "seed": self._base_seed + i} for i, own in enumerate(options)]
+        if set_state:
+            given = TensorDict({}, self.batch_size) if tensordict is None else tensordict
+            rows = given.exclude(*self.reset_keys).unbind(0)
+            options = [
+                {"tensordict": row, "set_state": True, **own}
+                for own, row in zip(options, rows, strict=True)
+            ]
         given = tensordict.keys(True) if tensordict is not None else ()
         masks = [tensordict.get(key) for key in self.reset_keys if key in given]
         indices = self._any(masks) if masks else range(self.num_workers)
@@ -227,7 +246,8 @@ class SerialVectorEnv(Vector):
             self.start()
         for index, own in options.items():
             env = self._envs[index]
-            self._last[index] = env.reset(**own).update(env.full_reward_spec.zero())
+            state = env.reset(**own).select(*env.observation_keys, *env.done_keys)
+            self._last[index] = state.update(env.full_reward_spec.zero())
 
     def _step_some(self, indices: Sequence[int], inputs: TensorDictBase) -> None:
         rows = inputs.exclude("_step", "next").unbind(0)

@@ -151,8 +151,8 @@ class VectorEnv(Vector):
             return super().__reduce_ex__(protocol)
         raise TypeError(
             "the processes of a vector cannot be copied: copy one with parallel=False, let another "
-            "vector continue the episodes, other.continue_from(envs.get_positions()), or use "
-            "get_state and set_state of a single environment"
+            "vector continue the episodes, other.continue_from(envs.get_positions()) or "
+            "other.reset(envs.get_state(), set_state=True)"
         )
 
     # -- commands ----------------------------------------------------------------------------

@@ -239,7 +239,7 @@ def run_state(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> None
         for name in ("after", "again", "once more"):
             trace = Trace(traces, name)
             if name != "after":
-                data = env.set_state(state)
+                data = env.reset(state.clone(), set_state=True).exclude("state")
                 trace.steps.append(marks(data))
             for action in [*future, None]:
                 data = data if "next" not in data else step_mdp(data)

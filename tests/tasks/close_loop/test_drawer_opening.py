@@ -323,7 +323,7 @@ def test_a_state_restores_the_travel_of_the_drawer(make):
     handle = env.scene.task.handle_pose
     env.reset()
     assert env.scene.task.cabinet.travel_m == pytest.approx(0.0, abs=1e-6)
-    env.set_state(kept)
+    env.reset(kept, set_state=True)
     assert env.scene.task.cabinet.travel_m == travel
     assert env.scene.task.handle_pose == handle
 

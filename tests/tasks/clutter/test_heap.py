@@ -264,7 +264,7 @@ def test_a_state_restores_the_heap(make, control):
     for _ in range(4):
         play(env, env.reset())
     assert names(env) != present
-    state = env.set_state(kept)
+    state = env.reset(kept, set_state=True)
     assert names(env) == present
     assert digest(env) == before
     assert torch.equal(image_of(state), image)
@@ -282,7 +282,7 @@ def test_the_episode_after_a_restored_success_is_the_same(make):
     env.reset()
     present = names(env)
     play(env, env.reset())
-    env.set_state(kept)
+    env.reset(kept, set_state=True)
     held = env.scene.robot.held_body()
     assert held.name == grasped
     env.reset()  # the held object counts as grasped without a new contact query

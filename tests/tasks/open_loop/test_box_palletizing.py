@@ -166,7 +166,7 @@ def test_a_state_restores_which_boxes_are_active(make_env):
     for _ in range(2):
         env.reset()
         assert len(task.objects) == 1
-        returned = env.set_state(kept)
+        returned = env.reset(kept, set_state=True)
         assert len(task.objects) == 2
         assert [body.is_hidden for body in task.pool.bodies] == [False] + [True] * 5  # one is held
     assert follow(env, returned)[-1]["success"]

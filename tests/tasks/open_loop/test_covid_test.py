@@ -430,12 +430,12 @@ def test_a_state_restores_the_tests_and_the_hidden_swabs(make):
     assert swab.is_hidden
     assert task.get_state().used_swabs == (task.swabs.index(swab),)
     later, there = env.get_state(), task.get_state()
-    env.set_state(kept)
+    env.reset(kept, set_state=True)
     assert motion.held is swab
     assert task.get_state().used_swabs == ()
     assert swab in task.objects
     for _ in range(2):  # while the swab is held, and from another episode
-        env.set_state(later)
+        env.reset(later, set_state=True)
         assert motion.held is not swab
         assert swab.is_hidden
         assert swab not in task.objects
@@ -452,10 +452,10 @@ def test_a_failure_is_part_of_the_state(make):
         lay(task, body, task.layout.test_area, (0.0, y))
     wait(env)
     failed = env.get_state()
-    env.set_state(kept)
+    env.reset(kept, set_state=True)
     assert not task.has_failed
     assert not wait(env)["done"]
-    assert env.set_state(failed)["terminated"]
+    assert env.reset(failed, set_state=True)["terminated"]
     assert task.has_failed
     env.reset()
     assert not task.has_failed

@@ -1,14 +1,23 @@
+"""BulletArmEnv: the class of all environments, their actions, faults and episodes."""
+
+import copy
 import logging
+import pickle
+from functools import partial
 
 import pybullet
 import pytest
 import torch
 from torchrl.collectors import Collector
+from torchrl.envs import EnvBase, ParallelEnv, check_env_specs
 
 import ba_torchrl
+from ba_torchrl import BulletArmEnv
+from ba_torchrl.data.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import faults
 from ba_torchrl.envs.checks import checked_action
-from ba_torchrl.errors import InvalidActionError, SimulationError
+from ba_torchrl.errors import ConfigError, InvalidActionError, SimulationError
+from ba_torchrl.tasks.base import TASKS
 
 TASK = "close_loop/block_picking"
 
@@ -19,6 +28,88 @@ def env():
     yield env
     if not env.is_closed:
         env.close()
+
+
+@pytest.mark.parametrize("task", [TASK, "open_loop/block_stacking"])
+def test_the_class_makes_an_environment_of_the_tasks_control(task):
+    envs = [
+        make(task, obs_size=16, seed=3) for make in (BulletArmEnv, ba_torchrl.make, BulletArmEnv)
+    ]
+    envs[2] = copy.deepcopy(envs[2])
+    assert {type(env) for env in envs} == {type(envs[0])} != {BulletArmEnv}
+    starts = [env.reset() for env in envs]
+    assert all((start == starts[0]).all() for start in starts)
+    assert all(isinstance(env, BulletArmEnv) and isinstance(env, EnvBase) for env in envs)
+    check_env_specs(envs[0], break_when_any_done="both")
+    for env in envs:
+        env.close()
+
+
+def test_an_environment_of_another_constructor_is_one_of_the_class():
+    env = make_deconstruction_env("open_loop/block_stacking", obs_size=16, num_objects=2)
+    assert isinstance(env, BulletArmEnv)
+    env.close()
+
+
+def test_available_envs_lists_the_tasks_of_plugins_too(env, monkeypatch):
+    assert BulletArmEnv.available_envs == env.available_envs == ba_torchrl.list_tasks()
+    monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries, "mine/task": TASKS[TASK]})
+    assert set(BulletArmEnv.available_envs) - set(ba_torchrl.list_tasks()) == set()
+    assert "mine/task" in BulletArmEnv.available_envs
+
+
+@pytest.mark.parametrize(
+    ("task", "config"),
+    [("close_loop/block_pick", {}), (TASK, {"num_object": 2}), (TASK, {"obs_size": "large"})],
+)
+def test_the_class_refuses_what_make_refuses(task, config):
+    messages = []
+    for make in (BulletArmEnv, ba_torchrl.make):
+        with pytest.raises(ConfigError) as error:
+            make(task, **config)
+        messages.append(str(error.value))
+    assert messages[0] == messages[1]
+    assert "Did you mean" in messages[0] or "obs_size" in messages[0]
+
+
+def test_the_class_is_a_constructor_for_processes_of_torchrl():
+    kwargs = [{"task": TASK, "obs_size": 16, "seed": seed} for seed in (0, 1)]
+    vector = ParallelEnv(2, BulletArmEnv, create_env_kwargs=kwargs, mp_start_method="fork")
+    made = pickle.loads(pickle.dumps(partial(BulletArmEnv, **kwargs[1])))()
+    try:
+        assert torch.equal(vector.reset()["depth"][1], made.reset()["depth"])
+    finally:
+        vector.close()
+        made.close()
+
+
+def test_the_device_is_that_of_specifications_and_outputs():
+    env = BulletArmEnv(TASK, obs_size=16, device="meta")  # which has no values
+    state = env.reset()
+    assert {str(env.device), str(state.device), state["depth"].device.type} == {"meta"}
+    assert env.action_spec.device.type == env.observation_spec["depth"].device.type == "meta"
+    env.close()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.parametrize("task", [TASK, "open_loop/block_stacking"])
+def test_an_environment_whose_tensors_are_on_a_gpu(task):
+    first, second = (BulletArmEnv(task, seed=0, device=name) for name in ("cuda", "cpu"))
+    check_env_specs(first)
+    first.set_seed(0)
+    other = second.reset().to("cuda")
+    state = first.reset()
+    for _ in range(2):
+        action = first.action_spec.rand()
+        state = first.step(state.set("action", action))["next"]
+        other = second.step(other.cpu().set("action", action.cpu()))["next"].to("cuda")
+        assert state.device.type == "cuda"
+        assert all(torch.equal(state[key], other[key]) for key in other.keys())  # noqa: SIM118
+    assert len(first.get_position()["actions"][0]) == 2
+    kept = first.get_state()
+    assert first.reset(kept, set_state=True).device.type == "cuda"
+    first.close()
+    second.close()
 
 
 @pytest.mark.parametrize(
