@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from ba_torchrl.data.augmentation.rigid import RigidAugmentation
     from ba_torchrl.data.augmentation.so2 import SO2Augmentation
     from ba_torchrl.data.augmentation.views import CenterCrop, RandomViews
+    from ba_torchrl.data.dataset import BulletArmExperienceReplay
     from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
     from ba_torchrl.data.demos import collect_demonstrations, expert_policy, expert_scores
     from ba_torchrl.data.episodes import collect_episodes, mean_length, success_rate
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from ba_torchrl.data.transitions import as_transitions
 
 _MODULES = {
+    "BulletArmExperienceReplay": "dataset",
     "CenterCrop": "augmentation.views",
     "ExpertPrioritizedSampler": "replay.prioritized",
     "FrameReplayBuffer": "replay.buffer",
@@ -45,6 +47,7 @@ _MODULES = {
 """Modules of the names, imported at their first use: files and formats need no torch."""
 
 __all__ = [
+    "BulletArmExperienceReplay",
     "CenterCrop",
     "ExpertPrioritizedSampler",
     "FrameReplayBuffer",

@@ -33,7 +33,7 @@ from ba_torchrl.data.files import (
 from ba_torchrl.data.formats.base import find_format
 from ba_torchrl.errors import ConfigError
 
-_METADATA_FILE = "demonstrations.json"
+METADATA_FILE = "demonstrations.json"
 _FORMAT = 2
 _LENGTHS, _SEPARATOR = "episode_lengths", "."
 
@@ -96,7 +96,7 @@ def save_demonstrations(
     }
     with complete_only(path) as scratch:
         write_state(scratch, {**entries, _LENGTHS: lengths})
-        write_text(scratch / _METADATA_FILE, json.dumps(metadata, indent=2) + "\n")
+        write_text(scratch / METADATA_FILE, json.dumps(metadata, indent=2) + "\n")
         seal(scratch)
 
 
@@ -139,7 +139,7 @@ def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, A
         ConfigError: there are none at ``path``, or their files are damaged.
     """
     path = Path(path)
-    if os.path.exists(path) and not os.path.exists(path / _METADATA_FILE):
+    if os.path.exists(path) and not os.path.exists(path / METADATA_FILE):
         raise ConfigError(
             f"no demonstrations of ours at {path}: export takes folders of `ba-torchrl collect` or "
             "`play`"
@@ -186,7 +186,7 @@ def _is_own(path: Path, mapping: object) -> bool:
     Raises:
         ConfigError: there is one, and a mapping of somebody else's entries.
     """
-    is_own = os.path.exists(path / _METADATA_FILE)
+    is_own = os.path.exists(path / METADATA_FILE)
     if is_own and mapping is not None:
         raise ConfigError(f"{path} has our entries; leave out the mapping (demonstrations_mapping)")
     return is_own or (mapping is None and find_format(path) is None)
@@ -199,7 +199,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
         ConfigError: there are none at ``path``, or their files are damaged.
     """
     try:
-        metadata = read_json(path / _METADATA_FILE)
+        metadata = read_json(path / METADATA_FILE)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     check(path)
@@ -207,7 +207,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
     if not isinstance(metadata, dict) or any(
         not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
     ):
-        raise ConfigError(f"{path / _METADATA_FILE} does not say what was collected")
+        raise ConfigError(f"{path / METADATA_FILE} does not say what was collected")
     if metadata.get("format") != _FORMAT:
         raise ConfigError(
             f"{path} is of another version: {RENAMED}; collect the demonstrations again"

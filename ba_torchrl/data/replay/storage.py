@@ -248,7 +248,8 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
         """Return transitions with decoded images, or their codes.
 
         A slice over the whole storage decodes every image; `column` decodes none. TorchRL's
-        `SliceSampler` takes such a slice for each batch, its sample unit `Sequence` one entry.
+        `SliceSampler` takes such a slice for each batch, its sample unit `Sequence` one entry; of
+        demonstrations, `BulletArmExperienceReplay` has decoded images.
 
         Args:
             index: of the transitions; or the key of an entry, of all transitions.
