@@ -21,8 +21,8 @@ BASE = (
     "actions",
     "hardware",
     "_generators",
+    "_lazy",
     "_malloc",
-    "_segment_tree",
     "_jit",
 )
 """Single files; one box in the picture."""

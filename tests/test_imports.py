@@ -26,7 +26,7 @@ EXTRA = {
     "__main__": {"cli"},
     "recipes": {"__init__", "record"},
 }
-SHARED = {"_generators", "_malloc", "_segment_tree", "_jit"}
+SHARED = {"_generators", "_lazy", "_malloc", "_jit"}
 APART = {
     "__init__": BASE | {"sim", "tasks", "envs", "training.policy"},
     "__main__": {"cli"},
@@ -35,8 +35,8 @@ APART = {
     "objectives": BASE | {"objectives", "envs.keys"},
     "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
     "_generators": set(),
+    "_lazy": set(),
     "_malloc": set(),
-    "_segment_tree": set(),
     "_jit": set(),
     "hardware": set(),
     # measurements, which read every part

@@ -35,6 +35,7 @@ def test_a_torchrl_script_works_as_torchrls_documentation_says():
         ParallelEnv(2, lambda: ba_torchrl.make(REACH, obs_size=16), mp_start_method="fork"),
         Compose(RewardScaling(0.0, 2.0), StepCounter(step_count_key="count")),
     )
+    data.use_python_segment_trees()
     replay = TensorDictPrioritizedReplayBuffer(
         alpha=0.6, beta=0.4, storage=LazyTensorStorage(50), batch_size=4
     )

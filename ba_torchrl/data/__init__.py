@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
+
+from ba_torchrl._lazy import lazy_names
 
 if TYPE_CHECKING:
     from ba_torchrl.data.augmentation.rigid import RigidAugmentation
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
     from ba_torchrl.data.replay.make import make_replay
     from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+    from ba_torchrl.data.replay.segment_tree import use_python_segment_trees
     from ba_torchrl.data.replay.symmetric import SymmetricSampler
     from ba_torchrl.data.transitions import as_transitions
 
@@ -43,6 +45,7 @@ _MODULES = {
     "mean_length": "episodes",
     "save_demonstrations": "demo_files",
     "success_rate": "episodes",
+    "use_python_segment_trees": "replay.segment_tree",
 }
 """Modules of the names, imported at their first use: files and formats need no torch."""
 
@@ -68,14 +71,7 @@ __all__ = [
     "mean_length",
     "save_demonstrations",
     "success_rate",
+    "use_python_segment_trees",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _MODULES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_MODULES[name]}"), name)
-
-
-def __dir__() -> list[str]:
-    return __all__
+__getattr__, __dir__ = lazy_names(__name__, _MODULES, __all__)

@@ -14,7 +14,6 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import _classproperty
 
-from ba_torchrl import _segment_tree
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.checks import ChecksPolicy, checked_action
 from ba_torchrl.envs.copying import CopiesWithState
@@ -35,8 +34,6 @@ from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits
-
-_segment_tree.install()  # for TorchRL's prioritised buffers of users
 
 
 class _MadeByTask(type(EnvBase)):

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import logging
+import math
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.data.replay_buffers.samplers import PrioritizedSampler
+from torchrl import torchrl_logger
+from torchrl.data.replay_buffers.samplers import (
+    MinSegmentTreeFp64,
+    PrioritizedSampler,
+    SumSegmentTreeFp64,
+)
 from torchrl.data.replay_buffers.storages import Storage
 
-from ba_torchrl import _segment_tree
 from ba_torchrl.data.files import StateFolder
+from ba_torchrl.data.replay.segment_tree import MinTree, SumTree
 from ba_torchrl.data.replay.storage import OneProcess, stored_flags
 from ba_torchrl.envs import keys
-
-_segment_tree.install()  # also for a replay without environments
 
 
 class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
@@ -54,19 +59,35 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             raise ValueError(
                 f"eps must be positive and expert_bonus not negative, got {eps}, {expert_bonus}"
             )
-        super().__init__(
-            max_capacity,
-            alpha=alpha,
-            beta=beta,
-            eps=0.0,  # TorchRL would add it to the largest p again
-            dtype=torch.float64,
-            reduction="mean",
-            device="cpu",
-        )
+        torchrl_logger.addFilter(_refuse)  # of native trees that did not load
+        try:
+            super().__init__(
+                max_capacity,
+                alpha=alpha,
+                beta=beta,
+                eps=0.0,  # TorchRL would add it to the largest p again
+                dtype=torch.float64,
+                reduction="mean",
+                device="cpu",
+            )
+        finally:
+            torchrl_logger.removeFilter(_refuse)
         self.eps = eps
         self.expert_bonus = expert_bonus
         self.expert_key = expert_key
         self._initial_beta = beta
+
+    def _init(self) -> None:
+        """Make empty trees: TorchRL's native ones, or NumPy's if they did not load."""
+        self._sum_tree = (SumSegmentTreeFp64 or SumTree)(self._max_capacity)
+        self._min_tree = (MinSegmentTreeFp64 or MinTree)(self._max_capacity)
+        self._max_priority = None
+
+    @property
+    def default_priority(self) -> float:
+        """Minus infinity, for which `update_priority` sets the largest priority so far. TorchRL's
+        buffers pass it for transitions without a TD error, in tensors of several types."""
+        return -math.inf
 
     def anneal(self, fraction: float) -> None:
         """Interpolate beta between its initial value and one; an initial value of zero is kept.
@@ -127,25 +148,25 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             index: of the transitions: [N], or for a storage of several dimensions [N, ndim] or a
                 tuple of tensors [N]. A negative one is that of a transition that is not stored.
             priority: absolute TD error of each transition, or a single one for all; without the
-                bonus.
+                bonus. Only `default_priority`: as `mark_update`.
             storage: storage with the expert flags, which TorchRL's buffers pass.
 
         Raises:
             ValueError: a priority is not finite, or the storage is missing and the bonus is not
                 zero.
         """
-        if priority is self.default_priority:  # what TorchRL's `add` passes without a TD error
-            return self.mark_update(index, storage=storage)
         index = torch.stack(index, -1) if isinstance(index, tuple) else index
         index = torch.as_tensor(index, dtype=torch.long, device="cpu")
         if index.ndim > 1:
             index = torch.from_numpy(np.ravel_multi_index(index.unbind(-1), storage.shape))
         index = index.reshape(-1)
-        error = torch.as_tensor(priority, dtype=self.dtype, device="cpu").reshape(-1).abs()
+        error = torch.as_tensor(priority, dtype=self.dtype, device="cpu").reshape(-1)
+        if (error == self.default_priority).all():
+            return self.mark_update(index)
         if not error.isfinite().all():
             raise ValueError("a TD error is not finite: the run has diverged")
         is_stored = index >= 0
-        index, error = index[is_stored], error.expand(index.shape)[is_stored]
+        index, error = index[is_stored], error.abs().expand(index.shape)[is_stored]
         if len(index):
             super().update_priority(index, error + self.eps + self._bonus(index, storage))
 
@@ -157,8 +178,9 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             index: as of `update_priority`.
             storage: as of `update_priority`; needed if it has several dimensions.
         """
-        largest = torch.as_tensor(self.default_priority, dtype=self.dtype, device="cpu")
-        super().update_priority(index, largest.clamp_min(1.0), storage=storage)
+        largest, _ = self._max_priority
+        largest = torch.as_tensor(largest or 1.0, dtype=self.dtype, device="cpu").clamp_min(1.0)
+        super().update_priority(index, largest, storage=storage)
 
     def _bonus(self, index: Tensor, storage: Storage | None) -> Tensor | float:
         if not self.expert_bonus:
@@ -200,3 +222,7 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         if largest is not None:
             self._max_priority = torch.tensor(largest, dtype=self.dtype, device="cpu"), place
         self.beta = state_dict["beta"]
+
+
+def _refuse(record: logging.LogRecord) -> bool:
+    return False

@@ -23,11 +23,14 @@ from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from ba_torchrl.data.replay.segment_tree import use_python_segment_trees
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+
+use_python_segment_trees()
 
 SIZE = 16
 CODECS = {"image": DepthQuantizer(0.32)}

@@ -1,8 +1,7 @@
-"""NumPy replacements of TorchRL's native segment trees.
+"""Segment trees in NumPy, for where TorchRL's native ones do not load.
 
 TorchRL's prioritised samplers need the trees of its native extension, and no published torchrl
-wheel has an extension that loads with torch 2.13; that of 0.14.1 loads with torch 2.14.1. The
-import of the environments calls `install`, which replaces only trees that did not load.
+wheel has an extension that loads with torch 2.13; that of 0.14.1 loads with torch 2.14.1.
 """
 
 from __future__ import annotations
@@ -155,8 +154,11 @@ _REPLACEMENTS = {
 }
 
 
-def install() -> None:
-    """Set these trees in TorchRL's prioritised sampler where the native ones did not load."""
+def use_python_segment_trees() -> None:
+    """Let TorchRL's prioritised samplers use these trees where its native ones did not load.
+
+    This sets names of a module of TorchRL. `ExpertPrioritizedSampler` works without it.
+    """
     for name, replacement in _REPLACEMENTS.items():
         if getattr(prioritized, name) is None:
             setattr(prioritized, name, replacement)
