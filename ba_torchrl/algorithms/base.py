@@ -6,7 +6,7 @@ An algorithm is a `LearnerConfig`, registered under its name, and a `Learner` th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import partial
@@ -25,13 +25,14 @@ from torchrl.data import ReplayBuffer
 from torchrl.envs import Transform
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
+from torchrl.trainers import OptimizationStepper
 from typing_extensions import Self
 
 from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
-from ba_torchrl.algorithms.optimizers import Optimizers
+from ba_torchrl.algorithms.optimizers import LossFunction, Optimizers, Update
 from ba_torchrl.config import StrictModel, changed
 from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
@@ -62,9 +63,6 @@ __all__ = [
 ]
 
 ALGORITHMS: Registry[type[LearnerConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
-
-LossFunction = Callable[[TensorDictBase], TensorDictBase]
-"""Losses, whose names begin with ``loss_``, and diagnostics of a batch."""
 
 
 class SeedUse(IntEnum):
@@ -321,13 +319,7 @@ class Learner(ABC):
         for transform in self.make_transforms():
             self.replay.append_transform(transform)
         self.optimizer = self.make_optimizer()
-        self.optimizers = Optimizers(
-            self.optimizer,
-            self.make_term_optimizers(),
-            self.make_scheduler,
-            clamp=config.gradient_clamp,
-            clamped=self.network_parameters(),
-        )
+        self.stepper = self.make_stepper()
 
     @property
     def network_spec(self) -> ActorCriticSpec:
@@ -425,6 +417,18 @@ class Learner(ABC):
         by default none. Their terms are in a stage without others."""
         return {}
 
+    def make_stepper(self) -> OptimizationStepper:
+        """Return what takes the gradient steps of an update: by default all optimisers with their
+        schedules. One of TorchRL's takes a step of `optimizer` on the sum of all stages, without a
+        schedule."""
+        return Optimizers(
+            self.optimizer,
+            self.make_term_optimizers(),
+            self.make_scheduler,
+            clamp=self.config.gradient_clamp,
+            clamped=self.network_parameters(),
+        )
+
     def make_scheduler(self, optimizer: Optimizer) -> LRScheduler:
         """Return the schedule of an optimiser's learning rate, which steps once per update."""
         end, updates = self.config.learning_rate_end_factor, self.problem.total_updates
@@ -514,7 +518,7 @@ class Learner(ABC):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.minimize(stage(batch) for stage in self.due_stages())
+        scalars = self.minimize(batch, self.due_stages())
         if self._prioritized_sampler() is not None:  # whose trees are on the CPU
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)
@@ -548,25 +552,25 @@ class Learner(ABC):
         the expert's transitions in a batch. It counts, returns and raises as `update`."""
         if self.init_loss is None:
             return self.update()
-        return self.minimize([self.init_loss(self.sample(demonstrations_only=True))])
+        return self.minimize(self.sample(demonstrations_only=True), [self.init_loss])
 
-    def minimize(self, stages: Iterable[TensorDictBase]) -> TensorDict:
-        """Take the steps of `step`, with its argument and result, and count the update."""
+    def minimize(self, batch: TensorDictBase, stages: Sequence[LossFunction]) -> TensorDict:
+        """Take the steps of `step`, with its arguments and result, and count the update."""
         before = len(self.host_tasks)
-        scalars = self.step(stages)
+        scalars = self.step(batch, stages)
         if self.averaged_policy is not None:
             self.averaged_policy.update_parameters(self.trained_policy)
         self.updates += 1
         self.host_tasks.run(before)
         return scalars
 
-    def step(self, stages: Iterable[TensorDictBase]) -> TensorDict:
-        """Take a gradient step on each of several sums of losses, then one step of schedules and
-        target network.
+    def step(self, batch: TensorDictBase, stages: Sequence[LossFunction]) -> TensorDict:
+        """Take the gradient steps on several sums of losses of a batch, then one step of the target
+        network.
 
         Args:
-            stages: losses, whose names begin with ``loss_``, and diagnostics. An iterator computes
-                each stage after the step on the one before.
+            batch: sampled transitions.
+            stages: see `make_stages`.
 
         Returns:
             The scalars of all stages, without gradient.
@@ -575,20 +579,15 @@ class Learner(ABC):
             FloatingPointError: a loss is not finite.
             ValueError: the losses of a stage have different optimisers.
         """
-        if isinstance(stages, TensorDictBase):
-            raise TypeError("a list of stages is needed, for example [self.loss(batch)]")
-        taken, is_finite, is_deferred = TensorDict(), True, self.host_tasks.is_deferred
-        for scalars in stages:
-            terms = {name: value for name, value in scalars.items() if name.startswith("loss_")}
-            loss = sum(terms.values())
-            is_finite = is_finite & torch.isfinite(loss)
-            values = {**scalars, IS_FINITE: is_finite}
-            self.host_tasks.submit(values, partial(check_finite, self.updates))
-            self.optimizers.minimize(loss, terms, is_finite if is_deferred else None)
-            taken.update(scalars.detach())
-        self.optimizers.step_schedules()
+        update = Update(stages, self._check_finite, self.optimizer, self.config.gradient_clamp)
+        scalars = self.stepper.step(update, batch)
         self.update_target()
-        return taken
+        return scalars
+
+    def _check_finite(self, scalars: TensorDictBase, is_finite: Tensor) -> Tensor | None:
+        values = {**scalars, IS_FINITE: is_finite}
+        self.host_tasks.submit(values, partial(check_finite, self.updates))
+        return is_finite if self.host_tasks.is_deferred else None
 
     def update_target(self) -> None:
         """Move the target network, if there is one, after the gradient steps of an update."""
@@ -620,13 +619,15 @@ class Learner(ABC):
         self.host_tasks.run()
         state = {name: part.state_dict() for name, part in self._stateful_parts().items()}
         draws = {name: each.get_state() for name, each in self.generators().items()}
-        return {**state, **self.optimizers.state_dict(), "updates": self.updates, **draws}
+        steps = {"optimizer": self.optimizer.state_dict(), **self.stepper.state_dict()}
+        return {**state, **steps, "updates": self.updates, **draws}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Restore the learner from a `state_dict` of any device."""
         for name, part in self._stateful_parts().items():
             part.load_state_dict(state[name])
-        self.optimizers.load_state_dict(state)
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.stepper.load_state_dict(state)
         self.updates = state["updates"]
         for name, generator in self.generators().items():
             generator.set_state(state[name].cpu())

@@ -1,17 +1,58 @@
-"""Optimisers of the terms of a loss."""
+"""Optimisers of the terms of a loss, as a stepper of TorchRL's trainers."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import torch
+from tensordict import TensorDict, TensorDictBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
+from torchrl.trainers import OptimizationStepper, Trainer
+
+LossFunction = Callable[[TensorDictBase], TensorDictBase]
+"""Losses, whose names begin with ``loss_``, and diagnostics of a batch."""
 
 
-class Optimizers:
+def loss_terms(scalars: TensorDictBase) -> dict[str, Tensor]:
+    """Return the losses among the results of a loss function, without the diagnostics."""
+    return {name: value for name, value in scalars.items() if name.startswith("loss_")}
+
+
+@dataclass
+class Update:
+    """An update of a learner, which a stepper takes in the place of a trainer.
+
+    The attributes besides `stages` and `check` are those that TorchRL's steppers read.
+    """
+
+    stages: Sequence[LossFunction]
+    """Losses in the order in which `Optimizers` minimises them. TorchRL's steppers minimise the sum
+    of all."""
+    check: Callable[[TensorDictBase, Tensor], Tensor | None]
+    """Called with the results of each stage, and whether all losses so far are finite; returns the
+    condition of `Optimizers.minimize`."""
+    optimizer: Optimizer
+    clip_norm: float | None
+    clip_grad_norm: bool = False
+    """False: `clip_norm` bounds each element of the gradient."""
+
+    def compute_loss(self, batch: TensorDictBase) -> TensorDict:
+        """Return the results of all stages."""
+        scalars = TensorDict()
+        for stage in self.stages:
+            scalars.update(stage(batch))
+        self.check(scalars, torch.isfinite(sum(loss_terms(scalars).values())))
+        return scalars
+
+
+class Optimizers(OptimizationStepper):
     """The optimisers of a learner and the schedules of their learning rates.
+
+    A trainer of TorchRL takes them as its ``optimization_stepper``.
 
     Args:
         main: of all terms of the loss that have no optimiser of their own.
@@ -41,6 +82,34 @@ class Optimizers:
                 if self._named.setdefault(f"{name}_", optimizer) is not optimizer:
                     raise ValueError(f"two optimisers have the name {name!r}")
         self.schedulers = {name: make_scheduler(each) for name, each in self._named.items()}
+
+    def step(self, trainer: Update | Trainer, sub_batch: TensorDictBase) -> TensorDict:
+        """Take a gradient step on the sum of losses of each stage, then one of the schedules.
+
+        Args:
+            trainer: computes the losses; those of TorchRL's trainer are a single stage. A stage is
+                computed after the step on the one before.
+            sub_batch: of transitions.
+
+        Returns:
+            The results of all stages, without gradient.
+
+        Raises:
+            ValueError: the losses of a stage have different optimisers.
+        """
+        is_update = isinstance(trainer, Update)
+        taken, is_finite, condition = TensorDict(), True, None
+        for stage in trainer.stages if is_update else [trainer.compute_loss]:
+            scalars = stage(sub_batch)
+            terms = loss_terms(scalars)
+            loss = sum(terms.values())
+            if is_update:
+                is_finite = is_finite & torch.isfinite(loss)
+                condition = trainer.check(scalars, is_finite)
+            self.minimize(loss, terms, condition)
+            taken.update(scalars.detach())
+        self.step_schedules()
+        return taken
 
     def of(self, terms: Collection[str]) -> list[Optimizer]:
         """Return the optimisers that minimise a sum of terms.

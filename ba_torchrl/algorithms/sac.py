@@ -375,4 +375,4 @@ class SAC(Learner):
         stages = [self.loss.contrastive_loss]
         if self.init_loss is not None:
             stages.insert(0, self.init_loss)
-        return self.minimize(stage(batch) for stage in stages)
+        return self.minimize(batch, stages)

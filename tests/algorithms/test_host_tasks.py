@@ -97,7 +97,7 @@ def test_a_loss_that_is_not_finite_changes_nothing_and_is_reported_in_the_next_u
     tmp_path, network, settings
 ):
     def steps():
-        states = learner.optimizers.state_dict()
+        states = learner.stepper.state_dict()
         names = [name for name in states if name.endswith("optimizer")]
         return [each["step"].item() for name in names for each in states[name]["state"].values()]
 
@@ -159,11 +159,11 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
     learner = deferred(algorithm, network, **settings)
     for _ in range(2):  # the optimiser's state exists afterwards
         batch = learner.sample()
-        learner.minimize(stage(batch) for stage in learner.stages)
+        learner.minimize(batch, learner.stages)
     learner.state_dict()
     batch = learner.sample()
     with ReadsOnTheHost() as reads:
-        learner.minimize(stage(batch) for stage in learner.stages)
+        learner.minimize(batch, learner.stages)
     # AveragedModel reads its own counter, which is on the CPU for any device
     counter = 2 * ["aten::_local_scalar_dense"] if learner.averaged_policy is not None else []
     assert reads.found == counter

@@ -2,9 +2,15 @@
 
 import math
 import warnings
+from types import SimpleNamespace
 
 import pytest
 import torch
+from torchrl.trainers import (
+    DefaultOptimizationStepper,
+    MixedPrecisionOptimizationStepper,
+    Trainer,
+)
 
 from ba_torchrl.algorithms.optimizers import Optimizers
 from tests.algorithms.tiny import FERM, build, transitions
@@ -84,7 +90,7 @@ def test_every_learning_rate_follows_the_schedule_of_the_run():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for number, expected in enumerate(torch.linspace(RATE, RATE / 10, 11).tolist()):
-            states = learner.optimizers.state_dict()
+            states = learner.stepper.state_dict()
             names = [name for name in states if name.endswith("optimizer")]
             assert len(names) == 3
             for name in names:
@@ -96,7 +102,7 @@ def test_every_learning_rate_follows_the_schedule_of_the_run():
 
 
 def test_weight_decay_of_all_optimisers_is_that_of_the_networks():
-    states = ferm(weight_decay=0.1).optimizers.state_dict()
+    states = ferm(weight_decay=0.1).stepper.state_dict()
     decay = {
         name: [group["weight_decay"] for group in state["param_groups"]]
         for name, state in states.items()
@@ -140,3 +146,62 @@ def test_only_gradients_of_the_step_are_clamped():
     first.grad = torch.full((1,), 3.0)
     optimizers.minimize((2 * second).sum(), ["loss_own"])
     assert (float(first.grad), float(second.grad)) == (3.0, 0.5)
+
+
+def updated(learner, optimize, updates=3):
+    """The parameters after some updates by a function of a batch."""
+    for number in range(updates):
+        torch.manual_seed(number)
+        optimize(learner.sample())
+    return list(learner.loss.state_dict().values())
+
+
+def learners(network="cnn", **settings):
+    """Two equal learners, and the parameters of a third after its own updates."""
+    made = [build("sac", network, **settings) for _ in range(3)]
+    for learner in made:
+        learner.extend(transitions(learner))
+    return *made[:2], updated(made[2], lambda batch: made[2].minimize(batch, made[2].stages))
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda learner: DefaultOptimizationStepper(),
+        lambda learner: MixedPrecisionOptimizationStepper(learner.optimizer, clip_norm=None),
+    ],
+    ids=["default", "mixed precision"],
+)
+def test_a_learner_takes_a_stepper_of_torchrl(make):
+    learner, other, expected = learners(replay="prioritized")
+    learner.stepper = make(learner)
+    found = updated(learner, lambda batch: learner.minimize(batch, learner.stages))
+    assert all(torch.equal(one, two) for one, two in zip(found, expected, strict=True))
+    other.stepper = make(other)
+    other.load_state_dict(learner.state_dict())
+    state, restored = (each.optimizer.state_dict()["state"] for each in (learner, other))
+    assert torch.equal(state[0]["exp_avg"], restored[0]["exp_avg"])
+    learner.sample = lambda: batch
+    batch = other.sample()
+    batch["next", "reward"] += torch.nan
+    with pytest.raises(FloatingPointError, match="not finite at update 3"):
+        learner.update()
+
+
+def test_a_trainer_of_torchrl_takes_the_optimisers():
+    settings = {"learning_rate_end_factor": 0.1, "gradient_clamp": 0.01, "weight_decay": 0.1}
+    learner, _, expected = learners(**settings)
+    trainer = Trainer(
+        collector=SimpleNamespace(state_dict=dict),
+        total_frames=1,
+        frame_skip=1,
+        optim_steps_per_batch=1,
+        loss_module=learner.loss,
+        optimization_stepper=learner.stepper,
+        progress_bar=False,
+    )
+    trainer.register_op("post_optim", learner.target_updater.step)
+    found = updated(learner, trainer.optim_steps)
+    assert all(torch.equal(one, two) for one, two in zip(found, expected, strict=True))
+    rate = trainer.state_dict()["optimization_stepper"]["optimizer"]["param_groups"][0]["lr"]
+    assert rate < learner.config.learning_rate

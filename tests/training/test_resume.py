@@ -115,7 +115,7 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path, changes)
     whole = run(config_for(tmp_path / "whole", **changes))
 
     assert result.updates == whole.updates == 9
-    assert experiment.algorithm.optimizers.state_dict()["scheduler"]["last_epoch"] == 9
+    assert experiment.algorithm.stepper.state_dict()["scheduler"]["last_epoch"] == 9
     a, b = (read_result(run.record.parent) for run in (result, whole))
     assert [point.updates for point in a.curve] == [0, 3, 6, 9]
     # two updates on demonstrations, then one for each step of both environments
@@ -151,7 +151,7 @@ def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_pa
     assert new.replay_size == old.replay_size
     for key, value in old.loss.state_dict().items():
         assert torch.equal(new.loss.state_dict()[key], value), key
-    states, restored = old.optimizers.state_dict(), new.optimizers.state_dict()
+    states, restored = old.stepper.state_dict(), new.stepper.state_dict()
     assert states.keys() == restored.keys()
     for name, state in states.items():
         if not name.endswith("optimizer"):

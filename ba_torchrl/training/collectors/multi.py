@@ -8,9 +8,9 @@ import logging
 import os
 import signal
 import threading
-import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
+from multiprocessing.process import BaseProcess
 from multiprocessing.queues import SimpleQueue
 from queue import Empty
 from typing import Any
@@ -18,14 +18,7 @@ from typing import Any
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import multiprocessing as mp
-from torchrl.collectors import (
-    Collector,
-    MultiAsyncCollector,
-    MultiSyncCollector,
-    _multi_async,
-    _multi_sync,
-    _runner,
-)
+from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.weight_update import MultiProcessWeightSyncScheme
 
 from ba_torchrl.envs.positions import Position
@@ -35,7 +28,6 @@ from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConf
 
 logger = logging.getLogger(__name__)
 
-_NO_TIMEOUT_S = 1e6
 _SHUTDOWN_S = 2.0
 _HEALTH_CHECK_S = 0.5
 
@@ -61,7 +53,7 @@ class MultiAsyncConfig(WorkersConfig):
     ) -> MultiCollection:
         """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
         frames = self.steps_per_batch * problem.num_envs // self.workers
-        return MultiCollection(problem, self, MultiAsyncCollector, frames)
+        return MultiCollection(problem, self, _AsyncCollector, frames)
 
 
 class MultiCollection(WorkerCollection):
@@ -101,7 +93,7 @@ class MultiCollection(WorkerCollection):
         """Send the weights and return a batch; see `WorkerCollection.collect`."""
         while True:
             try:
-                with _waiting_at_most(self._patience_s):
+                with _killed_after(self._patience_s, self._collector.procs):
                     self._collector.update_policy_weights_(self.weights())
                     batch = next(self._batches)
             # ValueError: TorchRL closes the other processes, which ignore its SIGTERM
@@ -138,7 +130,7 @@ class MultiCollection(WorkerCollection):
                 frames_per_batch=self._frames,
                 total_frames=-1,
                 storing_device="cpu",
-                weight_sync_schemes={"policy": _WeightSync(lambda: self._patience_s)},
+                weight_sync_schemes={"policy": _WeightSync()},
                 num_threads=torch.get_num_threads(),
                 auto_register_policy_transforms=False,
                 init_fn=partial(_prepare_worker, os.getpid() if is_main else None),
@@ -189,20 +181,19 @@ class _WorkersCollector(Collector):
             raise
 
 
-class _WeightSync(MultiProcessWeightSyncScheme):
-    """TorchRL's scheme, which notices that a worker ended instead of waiting for it forever.
+class _AsyncCollector(MultiAsyncCollector):
+    """TorchRL's collector with a place in the queue for each worker's batch.
 
-    Args:
-        patience_s: returns the seconds after which a worker that does not answer counts as hung.
+    TorchRL's queue has one place, and its workers discard a batch that finds none for a second.
     """
 
-    def __init__(self, patience_s: Callable[[], float]) -> None:
-        super().__init__()
-        self._patience_s = patience_s
+    @property
+    def _queue_len(self) -> int:
+        return self.num_workers
 
-    def __getstate__(self) -> dict[str, Any]:
-        """Return the state for a worker, which does not wait."""
-        return {**super().__getstate__(), "_patience_s": None}
+
+class _WeightSync(MultiProcessWeightSyncScheme):
+    """TorchRL's scheme, which notices that a worker ended instead of waiting for it forever."""
 
     def _wait_for_ack(
         self, worker_ids: int | list[int] | None = None, timeout: float | None = None
@@ -210,9 +201,8 @@ class _WeightSync(MultiProcessWeightSyncScheme):
         """Wait until all workers have the weights.
 
         Raises:
-            RuntimeError: a worker has ended, or does not answer.
+            RuntimeError: a worker has ended.
         """
-        deadline = time.monotonic() + self._patience_s()
         for queue in self._ack_queues.values():
             is_waiting = True
             while is_waiting:
@@ -222,34 +212,33 @@ class _WeightSync(MultiProcessWeightSyncScheme):
                 except Empty:
                     if not all(process.is_alive() for process in self.context.procs):
                         raise RuntimeError("a worker process has ended") from None
-                    if time.monotonic() > deadline:
-                        raise RuntimeError("a worker does not take the weights") from None
 
 
 def _prepare_worker(parent: int | None) -> None:
-    """Leave signals to the learner's process, and wait for it as long as it runs.
-
-    By default, TorchRL's workers discard a batch that the learner does not take within a second.
-    """
+    """Leave signals to the learner's process, and end with it."""
     if parent is not None:
         end_with(parent)
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, signal.SIG_IGN)
-    _runner._TIMEOUT = _NO_TIMEOUT_S
 
 
 @contextlib.contextmanager
-def _waiting_at_most(seconds: float) -> Iterator[None]:
-    """Context in which TorchRL's collectors wait so long for a batch and not forever."""
-    modules = (_multi_sync, _multi_async)
-    before = [module._MAX_IDLE_COUNT for module in modules]
-    for module in modules:
-        module._MAX_IDLE_COUNT = seconds / module._TIMEOUT
+def _killed_after(seconds: float, processes: Sequence[BaseProcess]) -> Iterator[None]:
+    """Context that kills processes when it takes too long; TorchRL waits for those that hang, and
+    notices an end within a second."""
+
+    def kill() -> None:
+        logger.warning("workers did not answer for %g s and are killed", seconds)
+        for process in processes:
+            process.kill()
+
+    timer = threading.Timer(seconds, kill)
+    timer.daemon = True
+    timer.start()
     try:
         yield
     finally:
-        for module, count in zip(modules, before, strict=True):
-            module._MAX_IDLE_COUNT = count
+        timer.cancel()
 
 
 @contextlib.contextmanager
