@@ -112,6 +112,7 @@ class MultiCollection(WorkerCollection):
         for process in self._collector.procs:  # those that do not end in time
             process.kill()
             process.join()
+        self._weight_sync.shutdown()  # at the interpreter's exit, TorchRL would wait forever
 
     def _start(self) -> MultiSyncCollector | MultiAsyncCollector:
         problem = self.problem
@@ -120,6 +121,7 @@ class MultiCollection(WorkerCollection):
         # A worker is killed when the thread that started it ends, so only for the main thread.
         is_main = threading.current_thread() is threading.main_thread()
         self._errors = mp.get_context(workers.start_method).SimpleQueue()
+        self._weight_sync = _WeightSync()
         with _start_method(workers.start_method):
             return self._collector_class(
                 self.make_envs(problem.make_env, self._restarts),
@@ -130,7 +132,7 @@ class MultiCollection(WorkerCollection):
                 frames_per_batch=self._frames,
                 total_frames=-1,
                 storing_device="cpu",
-                weight_sync_schemes={"policy": _WeightSync()},
+                weight_sync_schemes={"policy": self._weight_sync},
                 num_threads=torch.get_num_threads(),
                 auto_register_policy_transforms=False,
                 init_fn=partial(_prepare_worker, os.getpid() if is_main else None),
@@ -239,6 +241,7 @@ def _killed_after(seconds: float, processes: Sequence[BaseProcess]) -> Iterator[
         yield
     finally:
         timer.cancel()
+        timer.join()  # a process that is forked must not inherit its locks
 
 
 @contextlib.contextmanager

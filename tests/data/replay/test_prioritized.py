@@ -35,7 +35,7 @@ def back_ends():
         yield pytest.param(native, id="native")
 
 
-@pytest.mark.parametrize("trees", back_ends())
+@pytest.mark.parametrize("trees", [*back_ends()])
 @pytest.mark.parametrize("capacity", [1, 7, 64, 1000])
 def test_trees_against_plain_arrays(trees, capacity):
     rng = np.random.default_rng(0)
