@@ -79,11 +79,11 @@ def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     state, taken = {}, []
     minimize = learner.minimize
 
-    def record(losses):
+    def record(batch, stages):
         if learner.updates == 30:
             state["critic"] = learner.loss.qvalue_network_params.clone()
             state["error"] = demonstration_error(learner)
-        scalars = minimize(losses)
+        scalars = minimize(batch, stages)
         taken.append("loss_bc" in scalars)
         return scalars
 

@@ -47,9 +47,9 @@ def test_an_update_is_several_critic_updates_and_one_of_the_policy():
     step, sample = learner.step, learner.sample
     drawn = []
 
-    def record(loss):
+    def record(batch, stages):
         before = flat(learner.loss.actor_network_params), flat(learner.loss.qvalue_network_params)
-        step(loss)
+        step(batch, stages)
         after = flat(learner.loss.actor_network_params), flat(learner.loss.qvalue_network_params)
         taken.append(tuple(not torch.equal(*pair) for pair in zip(before, after, strict=True)))
         nonlocal target
