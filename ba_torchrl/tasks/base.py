@@ -9,7 +9,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
@@ -370,6 +370,25 @@ class CloseLoopTask(Task):
             f"no room for two objects {distance_m:.3f} m apart: enlarge `workspace` or lower "
             "`object_scale_range`"
         )
+
+
+class Versions(NamedTuple):
+    """Versions of a task and of its expert."""
+
+    task: int
+    expert: int
+
+    def __str__(self) -> str:
+        return f"task version {self.task}, expert version {self.expert}"
+
+
+def versions_of(task_id: str) -> Versions:
+    """Return the versions of a registered task and of its expert.
+
+    Raises:
+        UnknownNameError: there is no such task.
+    """
+    return Versions(TASKS[task_id].version, TASKS[task_id].expert_version)
 
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:
