@@ -80,14 +80,21 @@ class Registry(Generic[T]):
         known = (name for name in self if self._entries[name] is entry)
         return next(known, getattr(entry, "__name__", repr(entry)))
 
+    def entry(self, name: str) -> T:
+        """Return an entry; if it is registered, without the imports of the first look-up.
+
+        Raises:
+            UnknownNameError: nothing is registered under ``name``.
+        """
+        return self._entries[name] if name in self._entries else self[name]
+
     def plugin_module(self, name: str) -> str | None:
         """Return the module outside the package that registered ``name``; None if it is built in.
 
         Raises:
             UnknownNameError: nothing is registered under ``name``.
         """
-        if name not in self._modules:  # no look-up otherwise: it would scan in mid-import
-            _ = self[name]
+        self.entry(name)
         module = self._modules[name]
         return None if module.partition(".")[0] == PACKAGE else module
 

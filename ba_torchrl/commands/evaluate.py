@@ -15,7 +15,6 @@ from dataclasses import asdict, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ba_torchrl import __version__
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
     Count,
@@ -33,6 +32,7 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import wilson_interval
 from ba_torchrl.record.video import write_video
+from ba_torchrl.tasks.base import versions_of
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
@@ -172,7 +172,7 @@ def _evaluate(source: str, settings: Settings) -> None:
 def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:
     """Return the evaluation that a file of the folder holds, or play it and write that file.
 
-    It is played again if the policy's file, the episodes or the version of the package are others.
+    It is played again if the policy's file, the episodes or the version of the task are others.
     """
     from ba_torchrl.training.evaluation import Evaluation
 
@@ -184,7 +184,7 @@ def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:
         "seed": seed,
         "episodes": settings.episodes,
         "num_envs": settings.num_envs,
-        "ba_torchrl": __version__,
+        "task_version": versions_of(policy.task).task,
     }
     try:
         saved = dict(read_json(file))

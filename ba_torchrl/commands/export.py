@@ -69,6 +69,7 @@ def main(settings: Settings) -> None:
         seed=metadata["seed"],
         source=metadata["source"],
         policy=metadata.get("policy", ""),
+        expert_version=metadata["expert_version"],
     )
     path = Path(settings.path)
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,7 +22,6 @@ from ba_torchrl.data.exchange import (
     import_demonstrations,
 )
 from ba_torchrl.data.files import (
-    RENAMED,
     check,
     complete_only,
     read_json,
@@ -32,9 +32,12 @@ from ba_torchrl.data.files import (
 )
 from ba_torchrl.data.formats.base import find_format
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS, versions_of
+
+logger = logging.getLogger(__name__)
 
 METADATA_FILE = "demonstrations.json"
-_FORMAT = 2
+_FORMAT = 3
 _LENGTHS, _SEPARATOR = "episode_lengths", "."
 
 
@@ -78,9 +81,12 @@ def save_demonstrations(
     for key in steps.keys():  # noqa: SIM118 -- a TensorDict
         value = steps[key]  # an instruction is a string, or a list with one per step
         entries[key] = [value] * len(steps) if isinstance(value, str) else value
+    versions = versions_of(task)
     metadata = {
         "format": _FORMAT,
         "task": task,
+        "task_version": versions.task,
+        "expert_version": versions.expert,
         "env": env_values(task, env),
         "seed": seed,
         "source": source,
@@ -118,7 +124,8 @@ def load_demonstrations(
 
     Raises:
         ConfigError: there are none at ``path``, their files are damaged, or task or parameters
-            differ; the message names every difference.
+            differ; the message names every difference. Without a task, another version of it is a
+            warning.
     """
     path = Path(path)
     if not _is_own(path, mapping):
@@ -126,7 +133,8 @@ def load_demonstrations(
             raise ConfigError(f"{path} is of another library: name the task and its env")
         return import_demonstrations(path, task=task, env=env or {}, mapping=mapping)
     if task is None:
-        read_metadata(path)
+        if version := _other_version(read_metadata(path)):
+            logger.warning("the demonstrations at %s are of %s", path, version)
     else:
         check_demonstrations(path, task=task, env=env or {})
     return _read_episodes(path)
@@ -136,7 +144,8 @@ def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, A
     """Return the episodes of a folder that `save_demonstrations` wrote, and its metadata.
 
     Raises:
-        ConfigError: there are none at ``path``, or their files are damaged.
+        ConfigError: there are none at ``path``, their files are damaged, or their task has another
+            version.
     """
     path = Path(path)
     if os.path.exists(path) and not os.path.exists(path / METADATA_FILE):
@@ -145,7 +154,17 @@ def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, A
             "`play`"
         )
     metadata = read_metadata(path)
+    if version := _other_version(metadata):
+        raise ConfigError(f"the demonstrations at {path} are of {version}; collect them again")
     return _read_episodes(path), metadata
+
+
+def _other_version(metadata: dict[str, Any]) -> str | None:
+    """Return the version of a known task in words, None if it is the present one."""
+    task, found = metadata["task"], metadata["task_version"]
+    if task not in TASKS or found == versions_of(task).task:
+        return None
+    return f"version {found} of {task}, which has version {versions_of(task).task} here"
 
 
 def check_demonstrations(
@@ -173,7 +192,7 @@ def check_demonstrations(
     if _is_own(path, mapping):
         metadata = read_metadata(path)
         count = metadata["episodes"]
-        check_same_environment(path, task, env, metadata["task"], metadata["env"])
+        check_same_environment(path, task, env, metadata)
     else:
         count = count_demonstrations(path, task=task, env=env, mapping=mapping)
     if count < least:
@@ -203,15 +222,16 @@ def read_metadata(path: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
     check(path)
-    kinds = {"task": str, "env": dict, "episodes": int}
+    if isinstance(metadata, dict) and metadata.get("format") != _FORMAT:
+        raise ConfigError(
+            f"{path} has not the format {_FORMAT} of this version; collect the demonstrations again"
+        )
+    kinds = {"task": str, "env": dict, "episodes": int, "source": str}
+    kinds |= {"task_version": int, "expert_version": int}
     if not isinstance(metadata, dict) or any(
         not isinstance(metadata.get(name), kind) for name, kind in kinds.items()
     ):
         raise ConfigError(f"{path / METADATA_FILE} does not say what was collected")
-    if metadata.get("format") != _FORMAT:
-        raise ConfigError(
-            f"{path} is of another version: {RENAMED}; collect the demonstrations again"
-        )
     return metadata
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 import logging
 import os
@@ -41,6 +42,7 @@ from ba_torchrl.envs.description import summary
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import versions_of
 
 logger = logging.getLogger(__name__)
 
@@ -62,6 +64,7 @@ def export_demonstrations(
     seed: int,
     source: str = "expert",
     policy: str = "",
+    expert_version: int | None = None,
 ) -> None:
     """Write episodes for another library, with a card beside them.
 
@@ -75,6 +78,7 @@ def export_demonstrations(
         seed: of the first episodes.
         source: how the demonstrations were made, as for `save_demonstrations`.
         policy: which acted, in words.
+        expert_version: of the task's expert when they were made; None for the present one.
 
     Raises:
         ConfigError: the format is unknown or its package missing, ``path`` exists or has not the
@@ -111,13 +115,15 @@ def export_demonstrations(
     for key, entry in entries.items():
         named = entry.model_copy(update={"name": names[key]})
         entries[key] = named.model_copy(update={"file_shape": form.file_shape(named)})
-    values = env_values(task, env)
+    values, versions = env_values(task, env), versions_of(task)
     is_observed = keys.INSTRUCTION in roles
     texts = [str(each[keys.INSTRUCTION][0]) for each in arrays] if is_observed else []
     texts = list(dict.fromkeys(texts or [_instruction(task, env)]))
     card = Card(
         format=format,
         task=task,
+        task_version=versions.task,
+        expert_version=versions.expert if expert_version is None else expert_version,
         goal=summary(task),
         robot=values["robot"],
         source=source,
@@ -234,7 +240,7 @@ def _exported(
             f"{path} was written by another program; say where its entries belong in a mapping "
             f"(demonstrations_mapping). It holds {_listed(read_file(form, path))}"
         )
-    check_same_environment(path, task, env, card.task, card.env)
+    check_same_environment(path, task, env, vars(card))
     check_files(path, card)
     episodes = read_file(form, path)
     if len(episodes) != card.episodes:
@@ -643,16 +649,26 @@ def env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
 
 
 def check_same_environment(
-    path: Path, task: str, env: dict[str, Any], found_task: str, found_env: dict[str, Any]
+    path: Path, task: str, env: dict[str, Any], metadata: Mapping[str, Any]
 ) -> None:
-    """Check that demonstrations have the task and the parameters of a run.
+    """Check that demonstrations have the task, its version and the parameters of a run.
+
+    Another version of the expert is a warning, once.
+
+    Args:
+        path: of the demonstrations, for messages.
+        task: id of the task of the run.
+        env: fields of `EnvConfig` of the run.
+        metadata: of the demonstrations: task, versions, source and env.
 
     Raises:
         ConfigError: they differ; the message names every difference.
     """
+    versions = versions_of(task)
+    of_task = {"task": metadata["task"], "task_version": metadata["task_version"]}
     # A field that is missing in the file was added later and has its default value.
-    found = {"task": found_task, **env_values(task, {}), **found_env}
-    wanted = {"task": task, **env_values(task, env)}
+    found = {**of_task, **env_values(task, {}), **metadata["env"]}
+    wanted = {"task": task, "task_version": versions.task, **env_values(task, env)}
     differences = [
         f"{name}: collected with {found.get(name)!r}, needed {wanted.get(name)!r}"
         for name in sorted(found.keys() | wanted.keys())
@@ -662,6 +678,19 @@ def check_same_environment(
         raise ConfigError(
             f"the demonstrations at {path} do not fit:\n  " + "\n  ".join(differences)
         )
+    if metadata["source"] != "keyboard" and metadata["expert_version"] != versions.expert:
+        _warn_of_expert(path, task, metadata["expert_version"], versions.expert)
+
+
+@functools.cache
+def _warn_of_expert(path: Path, task: str, found: int, here: int) -> None:
+    logger.warning(
+        "the demonstrations at %s are of version %d of the expert of %s, which has version %d here",
+        path,
+        found,
+        task,
+        here,
+    )
 
 
 def _listed(episodes: Sequence[StoredArrays]) -> str:

@@ -9,7 +9,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 
 EXPERT_SCORES = "expert_scores.json"
 """File of `ba_torchrl.tasks`: by task and robot, what ``ba-torchrl experts`` measured."""
@@ -35,6 +35,8 @@ class TaskDescription:
 
     task: str
     """Id of the task."""
+    versions: Versions
+    """Of the task and of its expert."""
     text: str
     """Objects and goal, and what ends an episode early."""
     instruction: str
@@ -65,6 +67,7 @@ class TaskDescription:
     def rows(self) -> dict[str, str]:
         """Return everything except id and text, as text by heading; in brackets what is allowed."""
         rows = {
+            "version": f"{self.versions.task}, expert {self.versions.expert}",
             "instruction": self.instruction,
             "success": ", ".join(self.conditions),
             "randomised": "; ".join(self.randomised),
@@ -130,6 +133,7 @@ def describe(task: str) -> TaskDescription:
     scales = config.object_scale_range
     return TaskDescription(
         task=task,
+        versions=versions_of(task),
         text=inspect.cleandoc(cls.__doc__ or ""),
         instruction=instruction,
         conditions=conditions,

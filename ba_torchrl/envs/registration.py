@@ -22,13 +22,16 @@ ENTRY_POINT = "ba_torchrl.envs.gym:GymEnv"
 
 
 def gym_id(task: str) -> str:
-    """Return Gymnasium's id of a task.
+    """Return Gymnasium's id of a registered task, which ends in its version.
 
     The id of ``close_loop/block_picking`` is ``BulletArm/CloseLoopBlockPicking-v0``, and that of
     ``mine/push_far``, a task from outside the package, is ``BulletArm/MinePushFar-v0``.
     """
+    from ba_torchrl.tasks.base import versions_of
+
     words = task.replace("/", "_").split("_")
-    return f"{NAMESPACE}/{''.join(word.capitalize() for word in words)}-v0"
+    name = "".join(word.capitalize() for word in words)
+    return f"{NAMESPACE}/{name}-v{versions_of(task).task}"
 
 
 def register_task(task: str) -> None:

@@ -388,7 +388,8 @@ def versions_of(task_id: str) -> Versions:
     Raises:
         UnknownNameError: there is no such task.
     """
-    return Versions(TASKS[task_id].version, TASKS[task_id].expert_version)
+    task_class = TASKS.entry(task_id)
+    return Versions(task_class.version, task_class.expert_version)
 
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:

@@ -18,6 +18,7 @@ from ba_torchrl.envs.factory import make
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE
+from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.persistence import (
     DurableCheckpoint,
@@ -26,6 +27,9 @@ from ba_torchrl.training.persistence import (
     saved_steps,
     step_of,
 )
+
+_VERSIONS = ("task_version", "expert_version")
+"""Entries of a run's configuration file that are no settings."""
 
 
 class Checkpoints:
@@ -79,9 +83,10 @@ class Checkpoints:
 
 
 def write_config(config: ExperimentConfig) -> None:
-    """Write the run's configuration into its folder; the file appears when it is complete."""
+    """Write configuration and versions of a run; the file appears when it is complete."""
     config.folder.mkdir(parents=True, exist_ok=True)
-    text = json.dumps(config.model_dump(mode="json"), indent=2)
+    versions = dict(zip(_VERSIONS, versions_of(config.task), strict=True))
+    text = json.dumps({**versions, **config.model_dump(mode="json")}, indent=2)
     write_text(config.folder / CONFIG_FILE, text + "\n")
 
 
@@ -96,12 +101,32 @@ def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
         ConfigError: there is none, it does not parse, or it names plugins that are neither imported
             nor installed.
     """
+    saved = _read(folder)
+    values = {name: value for name, value in saved.items() if name not in _VERSIONS}
+    return parse_saved(values, Path(folder) / CONFIG_FILE, **changes)
+
+
+def read_versions(folder: str | Path) -> Versions:
+    """Return the versions of task and expert with which the run in a folder was started.
+
+    Raises:
+        ConfigError: there is no run, or it does not say them.
+    """
+    saved = _read(folder)
+    found = [saved.get(name) for name in _VERSIONS]
+    if not all(isinstance(version, int) for version in found):
+        raise ConfigError(
+            f"{Path(folder) / CONFIG_FILE} has no {' and '.join(_VERSIONS)}; train again"
+        )
+    return Versions(*found)
+
+
+def _read(folder: str | Path) -> dict[str, Any]:
     file = Path(folder) / CONFIG_FILE
     try:
-        saved = dict(read_json(file))
+        return dict(read_json(file))
     except (OSError, ValueError, TypeError, RecursionError) as error:
         raise ConfigError(f"cannot read {file}: {error}") from None
-    return parse_saved(saved, file, **changes)
 
 
 def parse_saved(saved: dict[str, Any], file: str | Path, **changes: Any) -> ExperimentConfig:

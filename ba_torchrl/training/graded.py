@@ -33,6 +33,7 @@ from ba_torchrl.envs import keys
 from ba_torchrl.envs.factory import make_vector_env
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on, evaluate
@@ -140,6 +141,7 @@ class GradedSets:
         check_demonstrations(path, task=self.task, env=self.env)
         found = read_metadata(path)
         wanted = {"source": grade, "seed": self.seed_of(grade), "episodes": self.episodes}
+        wanted["expert_version"] = versions_of(self.task).expert
         if different := [name for name, value in wanted.items() if found.get(name) != value]:
             raise ConfigError(
                 f"{path} holds another set ({', '.join(different)} differ); choose another path"

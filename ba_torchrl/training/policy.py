@@ -33,13 +33,14 @@ from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, known_names
 from ba_torchrl.record.results import RESULT_FILE, read_result, wilson_interval
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 from ba_torchrl.training.checkpoint import (
     Which,
     build_algorithm,
     find_checkpoint,
     load,
     parse_saved,
+    read_versions,
 )
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 
@@ -63,9 +64,13 @@ _WAY_OUT = "policy.make_env(), or a command without env.*, makes the environment
 class PolicyCard(StrictModel):
     """What is known of a policy in a file."""
 
-    format: Literal[2] = 2
-    """1: weights of kernels whose signs depended on the CPU."""
+    format: Literal[3] = 3
+    """1: weights of kernels whose signs depended on the CPU. 2: no versions."""
     task: str
+    task_version: int
+    """Of the training and of the episodes."""
+    expert_version: int
+    """Of the task's expert in the training."""
     label: str
     """Name of the method, such as "sacfd equi"."""
     config: dict[str, Any]
@@ -103,6 +108,7 @@ class TrainedPolicy(TensorDictModuleBase):
         config: of the run that trained it.
         updates: gradient updates of the policy.
         source: file or folder that it is from.
+        versions: of the task and its expert in the training.
         card: what is known of it, if it is from a file.
     """
 
@@ -112,6 +118,7 @@ class TrainedPolicy(TensorDictModuleBase):
         config: ExperimentConfig,
         updates: int,
         source: Path,
+        versions: Versions,
         card: PolicyCard | None = None,
     ) -> None:
         super().__init__()
@@ -124,6 +131,7 @@ class TrainedPolicy(TensorDictModuleBase):
         """Shape of each image and vector that the policy reads, without batch dimensions."""
         self._warned: set[str] = set()
         self.config, self.updates, self.source, self.card = config, updates, source, card
+        self.versions = versions
         self.eval()
 
     @property
@@ -243,7 +251,7 @@ def load_policy(
 
     Returns:
         A TensorDict module that reads `in_keys` and writes ``action``. ``policy.make_env()`` makes
-        its environment.
+        its environment. A warning says if it was trained in another version of its task.
 
     Raises:
         ConfigError: there is no such policy, its files are damaged, or it names plugins that are
@@ -265,7 +273,9 @@ def load_policy(
     if path.suffix != TENSORS:
         checkpoint = find_checkpoint(path, which)
         config, algorithm = load(checkpoint, **changes)
-        return TrainedPolicy(algorithm, config, algorithm.updates, checkpoint)
+        versions = read_versions(checkpoint.parent.parent)
+        _warn_of_version(config.task, versions)
+        return TrainedPolicy(algorithm, config, algorithm.updates, checkpoint, versions)
     card = read_card(path)
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
     config = parse_saved(card.config, path.with_suffix(CARD), **changes)
@@ -275,7 +285,22 @@ def load_policy(
     except (OSError, RuntimeError, SafetensorError) as error:
         reason = textwrap.shorten(str(error), 300)
         raise ConfigError(f"{path} does not hold the policy of its card: {reason}") from None
-    return TrainedPolicy(learner, config, card.updates, path, card)
+    versions = Versions(card.task_version, card.expert_version)
+    _warn_of_version(card.task, versions)
+    return TrainedPolicy(learner, config, card.updates, path, versions, card)
+
+
+def _warn_of_version(task: str, trained: Versions) -> None:
+    """Say that a policy was trained in another version of its task."""
+    here = versions_of(task).task
+    if trained.task != here:
+        logger.warning(
+            "the policy was trained in version %d of %s, which has version %d here: its success is "
+            "not comparable",
+            trained.task,
+            task,
+            here,
+        )
 
 
 def round_weights(policy: TrainedPolicy) -> None:
@@ -305,10 +330,16 @@ def save_policy(
         num_envs: number of environments that played them.
 
     Raises:
-        ConfigError: another process writes the file.
+        ConfigError: another process writes the file, or it was trained in another version of its
+            task.
         OSError: there is not enough space, or a file cannot be written.
     """
     path = Path(path)
+    if policy.versions.task != versions_of(policy.task).task:
+        raise ConfigError(
+            f"the policy was trained in version {policy.versions.task} of {policy.task}, and its "
+            f"episodes are of version {versions_of(policy.task).task}: train it again"
+        )
     run: dict[str, Any] = {}
     folder = policy.source.parent.parent
     if (folder / RESULT_FILE).exists():
@@ -331,6 +362,8 @@ def save_policy(
         words.append(f"plugins=[{','.join(policy.config.plugins)}]")
     card = PolicyCard(
         task=policy.task,
+        task_version=policy.versions.task,
+        expert_version=policy.versions.expert,
         label=policy.config.label,
         config=config,
         updates=policy.updates,

@@ -24,7 +24,8 @@ from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
-from ba_torchrl.training.checkpoint import read_config, write_config
+from ba_torchrl.tasks.base import versions_of
+from ba_torchrl.training.checkpoint import read_config, read_versions, write_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.persistence import (
     DurableCheckpoint,
@@ -160,12 +161,12 @@ def open_run_folder(config: ExperimentConfig) -> None:
 
 
 def check_same_run(config: ExperimentConfig) -> None:
-    """Check that the run in the folder of ``config`` was started with the same settings.
+    """Check that the run in the folder of ``config`` has the same settings, task and expert.
 
     The device may differ, and that of the folder need not exist on this machine.
 
     Raises:
-        ConfigError: it was not; the message names every difference.
+        ConfigError: it has not; the message names every difference.
     """
     started = read_config(config.folder, device=config.device)
     found = differences(started.resolved(), config.resolved())
@@ -173,6 +174,12 @@ def check_same_run(config: ExperimentConfig) -> None:
         lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
         raise ConfigError(
             f"the run in {config.folder} was started with other settings:\n  " + "\n  ".join(lines)
+        )
+    there, here = read_versions(config.folder), versions_of(config.task)
+    if there != here:
+        raise ConfigError(
+            f"the run in {config.folder} was started with {there} of {config.task}, here are "
+            f"{here}: choose another run_dir, or resume it with the package that started it"
         )
 
 

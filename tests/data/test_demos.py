@@ -14,6 +14,7 @@ from ba_torchrl.data.files import read_state, seal, write_state
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.envs import keys
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
 
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
@@ -96,14 +97,36 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     with pytest.raises(ConfigError, match="object_type: collected with 'cube', needed 'cylinder'"):
         load_demonstrations(tmp_path, task=TASK, env={**ENV, "object_type": "cylinder"})
     for name, message in (
-        ("format", "key pixels is now depth in close loop.*; collect"),
         ("task", "does not say what was collected"),
+        ("format", "has not the format 3 of this version; collect"),
     ):
         del metadata[name]
         file.write_text(json.dumps(metadata))
         seal(tmp_path)
         with pytest.raises(ConfigError, match=message):
             load_demonstrations(tmp_path, task=TASK, env=ENV)
+
+
+def test_other_versions_of_task_and_expert_are_refused_and_said(
+    collected, tmp_path, monkeypatch, caplog
+):
+    _, episodes = collected
+    save_demonstrations(tmp_path / "a", episodes, task=TASK, env=ENV, seed=0)
+    save_demonstrations(tmp_path / "b", episodes, task=TASK, env=ENV, seed=0, source="keyboard")
+    monkeypatch.setattr(TASKS[TASK], "expert_version", 2)
+    for name in ("a", "a", "b"):
+        load_demonstrations(tmp_path / name, task=TASK, env=ENV)
+    assert [record.message for record in caplog.records] == [
+        f"the demonstrations at {tmp_path / 'a'} are of version 0 of the expert of {TASK}, which "
+        "has version 2 here"
+    ]
+    monkeypatch.setattr(TASKS[TASK], "version", 1)
+    with pytest.raises(ConfigError, match="task_version: collected with 0, needed 1"):
+        load_demonstrations(tmp_path / "a", task=TASK, env=ENV)
+    with pytest.raises(ConfigError, match=r"are of version 0 of .*; collect them again"):
+        demo_files.read_demonstrations(tmp_path / "a")
+    load_demonstrations(tmp_path / "a")
+    assert caplog.messages[-1].endswith(f"are of version 0 of {TASK}, which has version 1 here")
 
 
 @pytest.mark.parametrize(

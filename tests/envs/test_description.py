@@ -8,7 +8,7 @@ import ba_torchrl
 from ba_torchrl.config import EnvConfig, EnvKeywords
 from ba_torchrl.envs import description
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import TASKS, versions_of
 
 
 def test_a_description_holds_what_the_environment_has():
@@ -23,6 +23,10 @@ def test_a_description_holds_what_the_environment_has():
         assert found.max_steps == env.max_steps
     finally:
         env.close()
+    assert found.versions == versions_of("open_loop/bin_packing")
+    assert f"version:            {found.versions.task}, expert {found.versions.expert}" in str(
+        found
+    )
     assert found.numbers_of_objects == tuple(range(1, 11))
     assert "a bin" in found.text
     assert "expert:             kuka 1.000 in 16.0 steps (200 episodes), panda 1.000 (50 ep" in str(

@@ -28,6 +28,11 @@ def test_gym_ids_are_camel_case(task, wanted):
     assert gym_id(task) == wanted
 
 
+def test_an_id_ends_in_the_version_of_the_task(monkeypatch):
+    monkeypatch.setattr(TASKS["close_loop/block_picking"], "version", 2)
+    assert gym_id("close_loop/block_picking") == PICKING.replace("-v0", "-v2")
+
+
 def test_every_task_has_an_id_of_its_own():
     specs = {spec.id: spec for spec in gymnasium.registry.values() if spec.namespace == "BulletArm"}
     assert {name: spec.kwargs["task"] for name, spec in specs.items()} == {

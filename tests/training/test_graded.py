@@ -13,6 +13,7 @@ from ba_torchrl.data import load_demonstrations
 from ba_torchrl.data.demo_files import read_metadata
 from ba_torchrl.data.files import complete_only
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import graded
 from ba_torchrl.training.graded import GRADES, GradedSets
 from tests.data.test_formats import assert_equal
@@ -85,7 +86,9 @@ def test_mixed_has_equal_parts_in_turn(sets):
     assert_equal(sets["mixed"], [*first, sets["random"][1]])
 
 
-def test_a_set_is_made_again_with_the_same_episodes_and_others_stay(folder, sets, tmp_path, rates):
+def test_a_set_is_made_again_with_the_same_episodes_and_others_stay(
+    folder, sets, tmp_path, rates, monkeypatch
+):
     shutil.copytree(folder, tmp_path / "sets")
     shutil.rmtree(tmp_path / "sets" / "random")
     shutil.rmtree(tmp_path / "sets" / "expert")
@@ -97,6 +100,9 @@ def test_a_set_is_made_again_with_the_same_episodes_and_others_stay(folder, sets
     assert rates == [0.5]  # nothing was trained
     with pytest.raises(ConfigError, match=r"random holds another set .seed, episodes differ"):
         made(tmp_path / "sets", episodes=5, seed=1)
+    monkeypatch.setattr(TASKS[TASK], "expert_version", 1)
+    with pytest.raises(ConfigError, match=r"random holds another set .expert_version differ"):
+        made(tmp_path / "sets")
     other = GradedSets(tmp_path / "other", TASK, 4, ENV, seed=1, num_envs=2, parallel=False)
     other.make("random")
     found = load_demonstrations(tmp_path / "other" / "random", task=TASK, env=ENV)

@@ -14,6 +14,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 import ba_torchrl
 from ba_torchrl.commands import evaluate
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import evaluation
 from ba_torchrl.training import policy as policies
 from ba_torchrl.training.checkpoint import load
@@ -127,6 +128,24 @@ def test_another_task_or_view_is_a_warning(shipped, changes, message, caplog):
     assert [record.message for record in caplog.records] == (
         [f"the policy was trained in another environment; here: {message}"] if message else []
     )
+
+
+def test_a_policy_of_another_version_of_its_task_is_said_and_not_exported(
+    run, tmp_path, monkeypatch, caplog
+):
+    policy, path = ba_torchrl.load_policy(run), tmp_path / "p.safetensors"
+    counts = {"successes": 1, "episodes": 1, "seed": 0, "num_envs": 1}
+    monkeypatch.setattr(TASKS[policy.task], "expert_version", 3)
+    card = policies.save_policy(policy, path, **counts)
+    assert (card.task_version, card.expert_version) == (0, 0)
+    assert not caplog.records
+    monkeypatch.setattr(TASKS[policy.task], "version", 1)
+    for source in (run, path):
+        ba_torchrl.load_policy(source)
+    start = f"the policy was trained in version 0 of {policy.task}, which has version 1 here"
+    assert [message.startswith(start) for message in caplog.messages] == [True, True]
+    with pytest.raises(ConfigError, match="its episodes are of version 1: train it again"):
+        policies.save_policy(policy, path, **counts)
 
 
 def test_any_batch_shape_is_taken(shipped):
@@ -291,7 +310,10 @@ def test_results_of_the_shipped_policies_are_kept(tmp_path, capsys, monkeypatch)
     recipe("evaluate", *words)
     recipe("evaluate", *words, "seed=3")
     recipe("evaluate", "trained", "task=close_loop/block_picking", *words[1:], "num_envs=2")
-    assert played == [20, 20, 20, 20]
+    with monkeypatch.context() as patch:
+        patch.setattr(TASKS["close_loop/block_picking"], "version", 1)
+        recipe("evaluate", *words, "num_envs=2")
+    assert played == [20, 20, 20, 20, 20]
     with pytest.raises(SystemExit):
         recipe("evaluate", "nothere", *words[1:])
     assert "folder: it is for policy=trained" in capsys.readouterr().err

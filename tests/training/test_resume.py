@@ -8,6 +8,7 @@ from torchrl.checkpoint import GlobalRNGState
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import experiment as experiments
 from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
 from ba_torchrl.training.config import ExperimentConfig
@@ -237,7 +238,7 @@ def test_without_a_run_to_resume_a_new_one_starts(tmp_path, caplog):
     assert "resume" not in caplog.text  # every new run of a grid has resume=True
 
 
-def test_a_changed_configuration_is_refused_by_name(tmp_path):
+def test_a_changed_configuration_is_refused_by_name(tmp_path, monkeypatch):
     config = config_for(tmp_path)
     interrupt(config, after=4)
     before = (config.folder / "config.json").read_bytes()
@@ -259,6 +260,9 @@ def test_a_changed_configuration_is_refused_by_name(tmp_path):
     ):
         assert line in str(error.value)
     assert str(error.value).count(" there, ") == 4
+    monkeypatch.setattr(TASKS[TINY["task"]], "expert_version", 1)
+    with pytest.raises(ConfigError, match="expert version 1: choose another run_dir, or resume it"):
+        Experiment(config_for(tmp_path, resume=True), progress=False)
     assert (config.folder / "config.json").read_bytes() == before
 
 

@@ -16,7 +16,6 @@ from safetensors.numpy import load_file
 
 from ba_torchrl.config import StrictModel
 from ba_torchrl.data.files import (
-    RENAMED,
     complete_only,
     fingerprint,
     json_bytes,
@@ -101,9 +100,12 @@ class Entry(StrictModel):
 class Card(StrictModel):
     """What is known of a file of demonstrations."""
 
-    card_format: Literal[2] = 2
+    card_format: Literal[3] = 3
     format: str
     task: str
+    task_version: int
+    expert_version: int
+    """Of the task's expert when the demonstrations were made."""
     goal: str
     """Of the task, in one sentence."""
     robot: str
@@ -159,6 +161,7 @@ class Card(StrictModel):
         """Return the card as a page, with the fields that the Hugging Face Hub reads."""
         rows = {
             "task": f"`{self.task}` (Gymnasium: `{gym_id(self.task)}`): {self.goal}",
+            "version": f"{self.task_version}, expert {self.expert_version}",
             "robot": self.robot,
             "demonstrations": f"{self.source}, first seed {self.seed}",
             "policy": self.policy or self.source,
@@ -300,15 +303,17 @@ def read_card(path: Path) -> Card | None:
         values = json.loads(text)
         if not isinstance(values, dict) or not {"format", "entries"} <= values.keys():
             return None  # somebody else's file of that name
+        if values.get("card_format") != Card.model_fields["card_format"].default:
+            raise ConfigError(f"{file} is of another version; export the demonstrations again")
         card = Card.model_validate_json(text)
+    except ConfigError:
+        raise
     except (OSError, ValueError, RecursionError) as error:
         what: Any = error
         if isinstance(error, ValidationError):
             first = error.errors()[0]
             what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
         raise ConfigError(f"{file} is damaged: {what}") from None
-    if "card_format" not in values:
-        raise ConfigError(f"{file} is of another version: {RENAMED}; export again")
     return card
 
 

@@ -26,6 +26,7 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 import ba_torchrl
+from ba_torchrl.envs.registration import gym_id
 from ba_torchrl.errors import ConfigError
 from profiling.fingerprint.cases import CONFIGS, Case
 
@@ -283,9 +284,7 @@ def run_gym(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> None:
     """Take random actions through Gymnasium."""
     import gymnasium
 
-    words = case.task.replace("/", "_").split("_")
-    name = f"BulletArm/{''.join(word.capitalize() for word in words)}-v0"
-    env = gymnasium.make(name, expert=True, **case.config)
+    env = gymnasium.make(gym_id(case.task), expert=True, **case.config)
     try:
         facts |= {"actions": str(env.action_space)}
         facts |= {f"observation {key}": str(s) for key, s in env.observation_space.items()}
