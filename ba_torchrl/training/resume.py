@@ -175,11 +175,20 @@ def check_same_run(config: ExperimentConfig) -> None:
         raise ConfigError(
             f"the run in {config.folder} was started with other settings:\n  " + "\n  ".join(lines)
         )
+    check_same_versions(config)
+
+
+def check_same_versions(config: ExperimentConfig) -> None:
+    """Check that the run in the folder of ``config`` has the present versions of task and expert.
+
+    Raises:
+        ConfigError: it has others.
+    """
     there, here = read_versions(config.folder), versions_of(config.task)
     if there != here:
         raise ConfigError(
             f"the run in {config.folder} was started with {there} of {config.task}, here are "
-            f"{here}: choose another run_dir, or resume it with the package that started it"
+            f"{here}: choose another folder, or use the package that started it"
         )
 
 

@@ -261,8 +261,8 @@ def test_a_changed_configuration_is_refused_by_name(tmp_path, monkeypatch):
         assert line in str(error.value)
     assert str(error.value).count(" there, ") == 4
     monkeypatch.setattr(TASKS[TINY["task"]], "expert_version", 1)
-    with pytest.raises(ConfigError, match="expert version 1: choose another run_dir, or resume it"):
-        Experiment(config_for(tmp_path, resume=True), progress=False)
+    with pytest.raises(ConfigError, match="expert version 1: choose another folder, or use the"):
+        check_same_run(config)
     assert (config.folder / "config.json").read_bytes() == before
 
 

@@ -215,7 +215,7 @@ def status(run: ExperimentConfig) -> Status:
     """
     from ba_torchrl.training.checkpoint import parse_saved, read_config
     from ba_torchrl.training.persistence import lock_holder
-    from ba_torchrl.training.resume import check_same_run, resumable_updates
+    from ba_torchrl.training.resume import check_same_run, check_same_versions, resumable_updates
 
     folder = run.folder
     if (folder / RESULT_FILE).exists():
@@ -232,6 +232,8 @@ def status(run: ExperimentConfig) -> Status:
                 f"{folder} holds a run with other settings; choose another folder:\n  "
                 + "\n  ".join(lines)
             )
+        if (folder / CONFIG_FILE).exists():
+            check_same_versions(run)
         return Status("done", f"success {result.final.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         try:

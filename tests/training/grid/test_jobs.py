@@ -16,6 +16,8 @@ import pytest
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import RunResult, read_result
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.launchers import local
@@ -130,6 +132,16 @@ def test_a_setting_that_is_newer_than_a_finished_run_has_its_default_there(tmp_p
     saved["config"]["env"]["reward"] = "dense"
     path.write_text(json.dumps(saved))
     with pytest.raises(ConfigError, match=r"env\.reward: 'dense' there, 'sparse' now"):
+        status(run)
+
+
+def test_a_finished_run_of_another_version_of_its_task_is_refused(tmp_path, fake, monkeypatch):
+    run = planned(tmp_path)[0]
+    fake([run])
+    write_config(run)
+    assert status(run).state == "done"
+    monkeypatch.setattr(TASKS[run.task], "version", 7)
+    with pytest.raises(ConfigError, match=r"here are task version 7, .*: choose another folder"):
         status(run)
 
 
