@@ -142,9 +142,7 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
 
 def _note(section: Section) -> str:
     """Return which policies the numbers are of, and where the curves start."""
-    runs = [run.result for run, _ in _by_seed(section)]
-    policies = " or ".join(sorted({run.final.policy for run in runs}))
-    text = f"The table has the {policies} policy of each run, on episodes that did not select it."
+    text = "The table has the last policy of each run, on episodes that did not select it."
     starts = (int(update) for group in section.groups for update in group.axis("updates")[:1])
     first = sorted({*starts} - {0})
     if first:
@@ -202,7 +200,10 @@ def _final(run: Run) -> dict[str, Any]:
     result = run.result
     where = {name: result.hardware.get(name) for name in ("cpu", "gpu")}
     where |= {"commit": result.versions.get("commit"), "folder": run.folder}
-    return {**result.final.model_dump(), "hours": result.seconds / 3600, **where}
+    last = result.last
+    test = {name: getattr(last, name) for name in ("updates", "episodes", "success_rate")}
+    test["mean_length"] = last.mean_length
+    return {**test, "hours": result.seconds / 3600, **where}
 
 
 def _markdown(part: dict[str, Any]) -> str:

@@ -19,7 +19,7 @@ from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
     CurvePoint,
-    FinalEvaluation,
+    TestedPolicy,
     RunResult,
     differences,
     flat,
@@ -96,16 +96,16 @@ class Group:
     def estimate(self) -> Estimate:
         """Success at the points of the curve and, last, in the final evaluation, [n + 1]."""
         points = [
-            [*curve, run.result.final] for curve, run in zip(self.curves, self.runs, strict=True)
+            [*curve, run.result.last] for curve, run in zip(self.curves, self.runs, strict=True)
         ]
         rates = np.array([[[point.success_rate for point in curve]] for curve in points])
         episodes = np.array([[[point.episodes for point in curve]] for curve in points])
         return estimate(rates, episodes)
 
     @property
-    def by_seed(self) -> dict[int, FinalEvaluation]:
+    def by_seed(self) -> dict[int, TestedPolicy]:
         """Final evaluations by seed."""
-        return {run.result.seed: run.result.final for run in self.runs}
+        return {run.result.seed: run.result.last for run in self.runs}
 
     def reaches(self, rate: float) -> tuple[float, float]:
         """Return the updates and environment steps at which the IQM's curve reaches a rate.
@@ -306,11 +306,11 @@ def _row(title: str, group: Group) -> dict[str, Any]:
         "task": group.task,
         "method": group.method,
         "seeds": len(results),
-        **_success(group.estimate, np.array([result.final.success_rate for result in results])),
+        **_success(group.estimate, np.array([result.last.success_rate for result in results])),
         "curve_mean": float(np.mean(curves)) if curves else float("nan"),
         "updates_to_80": updates,
         "env_steps_to_80": steps,
-        "mean_length": float(np.mean([result.final.mean_length for result in results])),
+        "mean_length": float(np.mean([result.last.mean_length for result in results])),
         "hours": float(np.mean([result.seconds for result in results])) / 3600,
     }
 

@@ -232,7 +232,7 @@ def status(run: ExperimentConfig) -> Status:
                 f"{folder} holds a run with other settings; choose another folder:\n  "
                 + "\n  ".join(lines)
             )
-        return Status("done", f"success {result.final.success_rate:.2f}")
+        return Status("done", f"success {result.last.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         try:
             read_config(folder, device=run.device)
