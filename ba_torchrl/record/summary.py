@@ -19,8 +19,8 @@ from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
     CurvePoint,
-    TestedPolicy,
     RunResult,
+    TestedPolicy,
     differences,
     flat,
     read_result,
