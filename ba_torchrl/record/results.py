@@ -150,7 +150,8 @@ class RunResult(StrictModel):
     expert_labels: int | None
     """States besides demonstrations that the expert labelled with its action."""
     precision: str
-    """Number format in which the networks compute: "float32", "bfloat16" or "tf32"."""
+    """Number format in which the networks compute, "float32", "bfloat16" or "tf32"; "bfloat16, then
+    float32" of a run that was resumed on another machine."""
     parameters: int
     """Parameters of the acting policy."""
     config: dict[str, Any]
@@ -168,7 +169,8 @@ class RunResult(StrictModel):
     finished: str
     """Time of the end of the run, UTC, ISO 8601."""
     files: dict[str, str]
-    """Paths of `curve`, `checkpoint` and optionally `video`, relative to the run folder."""
+    """Paths of `curve`, `checkpoint` of the last policy, the `best` one and optionally `video`,
+    relative to the run folder."""
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:

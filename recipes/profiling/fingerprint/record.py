@@ -355,7 +355,7 @@ def run_training(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> N
     traces["scalars"] = {"facts": {"updates": " ".join(steps)}, "steps": list(steps.values())}
     facts["updates"] = result.updates
     for name in ("episodes", "success_rate", "mean_length"):
-        facts[f"evaluation {name}"] = getattr(result.evaluation, name)
+        facts[f"evaluation {name}"] = getattr(result.last, name)
     for name, state in experiment.algorithm.state_dict().items():
         if any(True for _ in tensors(state)):
             facts[f"tensors of {name}"] = tensors_mark(state)
