@@ -5,8 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from torch import nn
-
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.data.episodes import Policy
 from ba_torchrl.hardware import hardware
@@ -22,7 +20,7 @@ from ba_torchrl.record.results import (
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import record_episodes
-from ba_torchrl.training.protocol import PROTOCOL, test_seed
+from ba_torchrl.training.protocol import PROTOCOL, count_parameters, test_seed
 from ba_torchrl.training.resume import Progress
 
 
@@ -135,8 +133,3 @@ def uses_expert(config: ExperimentConfig) -> bool:
     """
     plays = config.demonstrations > 0 and config.demonstrations_path is None
     return plays or config.algorithm_config.imitates == "expert_everywhere"
-
-
-def count_parameters(policy: nn.Module) -> int:
-    """Return the number of parameters of an acting policy."""
-    return sum(parameter.numel() for parameter in policy.parameters())

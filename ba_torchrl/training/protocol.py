@@ -10,6 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from tensordict import TensorDict
+from torch import nn
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
@@ -35,6 +36,7 @@ def run_test(
     updates: int,
     episodes: int = TEST_EPISODES,
     on_episode: Callable[[TensorDict], None] | None = None,
+    first_seed: int = FIRST_TEST_SEED,
 ) -> TestedPolicy:
     """Play the first episodes of a test greedily; the weights stay constant.
 
@@ -47,8 +49,9 @@ def run_test(
         updates: gradient updates of the policy.
         episodes: their number.
         on_episode: called with each episode when it ends, for progress bars.
+        first_seed: of the episodes; with another than the protocol's, it is no test.
     """
-    seeds = [test_seed(episode) for episode in range(episodes)]
+    seeds = [first_seed + episode for episode in range(episodes)]
     with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
         played = play_seeds(env, policy, seeds, on_episode)
     return TestedPolicy(
@@ -57,3 +60,8 @@ def run_test(
         successes=[int(is_success(episode)) for episode in played],
         lengths=[len(episode) for episode in played],
     )
+
+
+def count_parameters(policy: nn.Module) -> int:
+    """Return the number of parameters of an acting policy."""
+    return sum(parameter.numel() for parameter in policy.parameters())
