@@ -21,6 +21,7 @@ DEMONSTRATIONS = "demos/pulling"
 SHORTER = {
     "agent.learn(10_000)": "agent.learn(120)",
     "n_eval_episodes=20": "n_eval_episodes=1",
+    "episodes=500)": "episodes=2)",
     "buffer_size=10_000": "buffer_size=200",
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 2,',
     '"mine/tall_block", 4)': '"mine/tall_block", 1)',
