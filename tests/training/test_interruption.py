@@ -158,6 +158,22 @@ def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undi
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
+def test_a_run_that_was_killed_counts_each_label_once(tmp_path):
+    options = {"algorithm": {"name": "dagger", "batch_size": 4}, "eval_every": 50}
+    whole = run(config_for(tmp_path / "whole", **options))
+    assert whole[1]["expert_labels"] == whole[1]["env_steps"] > 0
+    assert (whole[1]["demonstrations"], whole[1]["demonstration_steps"] >= 2) == (2, True)
+    config = config_for(tmp_path / "run", **options, resume=True, save_minutes=1e-9)
+    experiment = Experiment(config, progress=False)
+    at_call(experiment, experiment.algorithm, "update", 11, kill)
+    with pytest.raises(Killed):
+        experiment.run()
+    assert_same(run(config), whole)
+    record = read_result(tmp_path / "run")
+    assert record.resumed_at == [10]
+    assert record.seconds == pytest.approx(sum(record.phase_seconds.values()))
+
+
 @pytest.mark.parametrize("evaluation", [1, pytest.param(2, marks=SLOW), 3])
 def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evaluation):
     experiment = Experiment(config_for(tmp_path), progress=False)

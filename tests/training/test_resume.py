@@ -348,6 +348,6 @@ def test_the_result_holds_the_whole_run(tmp_path):
     assert values["versions"]["torch"] == torch.__version__
     assert values["hardware"]["cores"] >= 1
     assert values["hardware"]["cpu"]
-    assert set(values["files"]) == {"curve", "checkpoint", "video"}
+    assert set(values["files"]) == {"curve", "checkpoint", "best", "video"}
     assert all((config.folder / file).exists() for file in values["files"].values())
     assert values["seconds"] == pytest.approx(result.seconds)
