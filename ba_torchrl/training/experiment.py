@@ -227,10 +227,11 @@ class Experiment:
         self.log.write(last.updates, {**rates, "final/best_success_rate": best.success_rate})
         curve = plot_curve(config, progress.curve)
         progress.phase_seconds = self._clock.seconds()
+        seconds = sum(progress.phase_seconds.values())
         files = {"curve": curve, "checkpoint": latest, "best": best_checkpoint, "video": video}
         record = write_record(config, self.algorithm, last, best, progress, files)
         self._state.remove()
-        return Result(last, best, latest, curve, video, record, self._clock.total())
+        return Result(last, best, latest, curve, video, record, seconds)
 
     # -- parts -------------------------------------------------------------------------------
 
