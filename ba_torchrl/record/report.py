@@ -140,14 +140,17 @@ def plot_groups(
     """
     panels: dict[str, dict[str, Learning]] = {group.task: {} for group in groups}
     for group in groups:
+        x, curve = group.axis(axis), group.curve
+        if len(set(x)) == 1:  # as without steps but demonstrations
+            x, curve = x[-1:], [values[-1:] for values in curve]
         runs = [
-            ([getattr(point, axis) for point in curve], [point.success_rate for point in curve])
-            for curve in (run.result.curve for run in group.runs)
+            ([getattr(point, axis) for point in points], [point.success_rate for point in points])
+            for points in (run.result.curve for run in group.runs)
         ]
         demonstrations = [run.result.demonstration_steps or 0 for run in group.runs]
         panels[group.task][group.method] = Learning(
-            (group.axis(axis), *group.curve),
-            runs if runs[1:] else (),
+            (x, *curve),
+            runs if runs[1:] and x.size > 1 else (),
             float(np.mean(demonstrations)) if axis == "env_steps" else 0.0,
         )
     plot_panels(
@@ -290,16 +293,16 @@ def _final(run: Run) -> dict[str, Any]:
 def _markdown(part: dict[str, Any]) -> str:
     lines = [f"## {part['title']}", "", part["note"]]
     lines += [line for text in part["warnings"] for line in ("", f"**{text}**")]
-    lines += ["", *_pipes(_HEADER, ([text for text, _ in row] for row in part["rows"]))]
+    lines += ["", *pipes(_HEADER, ([text for text, _ in row] for row in part["rows"]))]
     if part["compared"]:
-        lines += ["", "Comparisons:", "", *_pipes(_COMPARISONS_HEADER, part["compared"])]
+        lines += ["", "Comparisons:", "", *pipes(_COMPARISONS_HEADER, part["compared"])]
     if part["settings"]:
         lines += ["", "Settings in which methods differ:", ""]
-        lines += _pipes(_SETTINGS_HEADER, part["settings"])
+        lines += pipes(_SETTINGS_HEADER, part["settings"])
     return "\n".join([*lines, "", *(f"- {machine}" for machine in part["machines"])])
 
 
-def _pipes(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def pipes(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return the lines of a table in Markdown."""
     return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]
 

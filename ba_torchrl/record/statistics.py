@@ -116,19 +116,22 @@ def probability_of_improvement(
     """Return the probability that a run of the first method has the higher success on its task.
 
     It is the mean over tasks of the share of pairs of runs, ties as one half (Agarwal et al.,
-    2021), with the interval of a bootstrap over runs, stratified by task. Where all runs of one
-    method have the higher success, the interval is a point.
+    2021), with the interval of a bootstrap over runs, stratified by task. The interval is never
+    narrower than Wilson's of as many pairs as the method with fewer runs has runs, whose variance
+    is the largest that the share can have (Birnbaum & Klose, 1957).
 
     Args:
         tasks: of each task the success rates of both methods' runs, [runs] each.
     """
-    value, drawn = 0.0, np.zeros(RESAMPLES)
+    value, pairs, drawn = 0.0, 0, np.zeros(RESAMPLES)
     for first, second in tasks:
         wins = (np.sign(np.subtract.outer(first, second)) + 1) / 2
         rows, columns = (generator.integers(n, size=(RESAMPLES, n)) for n in wins.shape)
         value += wins.mean() / len(tasks)
+        pairs += min(wins.shape)
         drawn += wins[rows[:, :, None], columns[:, None, :]].mean((1, 2)) / len(tasks)
-    return Estimate(float(value), *map(float, _quantiles(drawn)))
+    (low, high), floor = _quantiles(drawn), wilson(value, pairs)
+    return Estimate(float(value), float(min(low, floor.low)), float(max(high, floor.high)))
 
 
 def area_under_success(steps: Sequence[int], rates: Sequence[float], end: int) -> float:

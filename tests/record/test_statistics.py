@@ -164,7 +164,8 @@ def test_the_probability_of_improvement_is_the_share_of_pairs():
     assert 0 <= low < value < high <= 1
     over_tasks = probability_of_improvement([(first, second), (second, first)], generator())
     assert over_tasks.value == pytest.approx(0.5)
-    assert probability_of_improvement([([0.9], [0.8, 0.1])], generator()) == (1, 1, 1)
+    found = probability_of_improvement([([0.9] * 5, [0.8, 0.1] * 3)], generator())
+    assert found == pytest.approx((1, *wilson_interval(5, 5)))
 
 
 @pytest.mark.parametrize(
