@@ -19,7 +19,6 @@ from ba_torchrl.record.leaderboard import LEGEND, Leaderboard, leaderboard, pack
 from ba_torchrl.record.report import pipes
 from ba_torchrl.record.results import why_unfinished
 from ba_torchrl.record.summary import load_runs
-from ba_torchrl.training.protocol import PROTOCOL
 
 
 class Settings(PluginSettings):
@@ -50,6 +49,8 @@ def main(settings: Settings) -> None:
 
 def read(roots: Sequence[str]) -> tuple[Leaderboard, list[Path]]:
     """Return the table with the runs below some folders, and the folders of unfinished runs."""
+    from ba_torchrl.training.protocol import PROTOCOL  # imports torch, which takes seconds
+
     own, unfinished = load_runs(roots, completed)
     return leaderboard(package_runs(completed), own, list_tasks(), PROTOCOL), unfinished
 

@@ -36,6 +36,7 @@ COMMANDS = (
     "experts",
     "export",
     "gallery",
+    "leaderboard",
     "play",
     "plot",
     "report",
