@@ -3,7 +3,8 @@
 python -m docs.results                        # the page
 python -m docs.results runs/cpu_close_loop    # add the records of these runs first
 
-A record is the `result.json` of a finished run or of the test of a policy, in ba_torchrl/results.
+A record is the `result.json` of a finished run, or the test of a policy (`docs.shipped`), in
+ba_torchrl/results.
 """
 
 from __future__ import annotations
@@ -57,8 +58,7 @@ def add(roots: Sequence[str]) -> int:
     runs, _ = load_runs(roots)
     for run in runs:
         result = run.result
-        kind = "" if result.policy_file is None else " policy"
-        name = f"{result.task} {result.label} seed{result.seed}{kind}"
+        name = f"{result.task} {result.label} seed{result.seed}"
         path = RECORDS / ("".join(c if c.isalnum() or c in "-." else "_" for c in name) + ".json")
         write_text(path, result.model_dump_json() + "\n")
     return len(runs)

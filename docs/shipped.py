@@ -11,11 +11,9 @@ from hashlib import sha256
 from pathlib import Path
 
 from ba_torchrl.data.files import json_bytes, write_text
+from ba_torchrl.record.leaderboard import RECORDS
 from ba_torchrl.record.results import RunResult
 from ba_torchrl.training.policy import CARD, read_card, shipped_file, tested_card
-from docs.sources import ROOT
-
-RECORDS = ROOT / "ba_torchrl" / "results"
 
 
 def take(file: Path) -> str:

@@ -9,7 +9,7 @@ from ba_torchrl.commands import leaderboard as command
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record import leaderboard as boards
 from ba_torchrl.record.leaderboard import leaderboard
-from ba_torchrl.record.results import read_result, write_result
+from ba_torchrl.record.results import read_result
 from ba_torchrl.record.summary import Run
 from ba_torchrl.tasks.base import TASKS
 from docs import results as page
@@ -115,13 +115,14 @@ def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
     )
     for seed in range(2):
         make_run(tmp_path / f"runs/{seed}", seed=seed)
-    file = make_run(tmp_path / "runs/file", policy_file="0f", task=PICK, curve=[], env_steps=None)
-    write_result(file.folder, file.result.model_copy(update={"seconds": None}))
-    assert page.add([str(tmp_path / "runs")]) == 3
+    assert page.add([str(tmp_path / "runs")]) == 2
+    file = make_run(tmp_path / "file", policy_file="0f", task=PICK, curve=[], env_steps=None)
+    file = file.result.model_copy(update={"seconds": None})
+    (records / "trained.json").write_text(file.model_dump_json())
     assert sorted(path.name for path in records.iterdir()) == [
-        "close_loop_block_picking_sacfd_equi_seed0_policy.json",
         "close_loop_block_reaching_sacfd_equi_seed0.json",
         "close_loop_block_reaching_sacfd_equi_seed1.json",
+        "trained.json",
     ]
     text = page.page_with_results(NO_RECORDS)
     assert "| sacfd equi (policy from a file) | sacfd equi (policy of a run) |" in text
