@@ -146,8 +146,12 @@ class WorkerOptions(StrictModel):
 
 Rgb = tuple[float, float, float]
 
-MAX_SEED = 2**63 - 1
-"""The largest seed that all generators accept."""
+MAX_SEED = 2**52 - 1
+"""The largest seed of a run or a command. Seeds that are derived from it are below 2**32."""
+FIRST_TEST_SEED = 9 * 10**15
+"""Seed of the first episode of a test; see `ba_torchrl.training.protocol`. It is exact as a number
+of JSON, below 2**53. Its upper 32 bits are above two million: NumPy's seeds [a + 2**32 b, 0] and
+[a, b] give the same numbers, those of episode b of seed a."""
 
 CUSTOM_PHYSICS = ("time_step_s", "solver_iterations", "solver_residual")
 

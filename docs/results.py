@@ -1,31 +1,33 @@
-"""Write results.md and its curves from the results of finished runs in docs/results.
+"""Write results.md and its curves from the package's records.
 
 python -m docs.results                        # the page
-python -m docs.results runs/cpu_close_loop    # copy the results of these runs first
+python -m docs.results runs/cpu_close_loop    # add the records of these runs first
 
-Of a run, `result.json` (curve, final evaluation, machine, versions) and `config.json` are kept, in
-the folders of its grid. `ba-torchrl report docs/results` makes a report of them.
+A record is the `result.json` of a finished run, or the test of a policy (`docs.shipped`), in
+ba_torchrl/results.
 """
 
 from __future__ import annotations
 
-import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 from ba_torchrl.commands.report import completed
+from ba_torchrl.data.files import write_text
 from ba_torchrl.envs.description import describe
-from ba_torchrl.record.report import plot_section
-from ba_torchrl.record.results import (
-    CONFIG_FILE,
-    RESULT_FILE,
-    read_result,
-    run_folders,
-    wilson_interval,
+from ba_torchrl.record.leaderboard import (
+    LEGEND,
+    RECORDS,
+    Leaderboard,
+    cell_text,
+    leaderboard,
+    package_runs,
 )
-from ba_torchrl.record.summary import OTHER_RUNS, Group, Run, Section, load_sections
+from ba_torchrl.record.report import pipes, plot_groups
+from ba_torchrl.record.summary import Group, load_runs
 from ba_torchrl.record.task_page import tasks_by_heading
-from ba_torchrl.training.policy import read_card, shipped_file
+from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.protocol import PROTOCOL
 from docs.sources import ROOT
 
 PAGE = ROOT / "docs" / "results.md"
@@ -36,112 +38,116 @@ HEADER = (
     "",
     "expert",
     "method",
-    "seed",
-    "success of the policy",
+    "success",
+    "best",
     "steps",
-    "update",
-    "updates",
+    "demonstrations",
     "environment steps",
     "minutes",
+    "processors",
     "commit",
 )
 
 
-def copy(roots: list[str]) -> int:
-    """Copy the results of the finished runs below some folders into docs/results.
+def add(roots: Sequence[str]) -> int:
+    """Write the records of the finished runs below some folders into the package.
 
     Returns:
         Their number.
     """
-    finished, _ = run_folders(roots)
-    for folder in finished:
-        benchmark = read_result(folder).benchmark or "other"
-        target = FOLDER.joinpath(benchmark, *folder.resolve().parts[-3:])
-        target.mkdir(parents=True, exist_ok=True)
-        for name in (RESULT_FILE, CONFIG_FILE):
-            shutil.copyfile(folder / name, target / name)
-    return len(finished)
+    runs, _ = load_runs(roots)
+    for run in runs:
+        result = run.result
+        name = f"{result.task} {result.label} seed{result.seed}"
+        path = RECORDS / ("".join(c if c.isalnum() or c in "-." else "_" for c in name) + ".json")
+        write_text(path, result.model_dump_json() + "\n")
+    return len(runs)
 
 
-def sections() -> list[Section]:
-    """Return the runs of each benchmark in docs/results, in the order of their names."""
-    return [
-        each for each in load_sections([FOLDER], completed=completed)[0] if each.title != OTHER_RUNS
-    ]
+def present() -> Leaderboard:
+    """Return the package's records by task and method, tasks of plugins left out."""
+    tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
+    return leaderboard(package_runs(completed), [], tasks, PROTOCOL)
 
 
 def page_with_results(text: str) -> str:
-    """Return the page with tables of the present results."""
+    """Return the page with tables of the present records."""
     start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    parts = ["\n".join(_section(section)) for section in sections()]
-    return text[:start] + "\n" + "\n\n".join(parts) + "\n\n" + text[end:]
+    board = present()
+    header, *rows = board.rows()
+    parts = [f"{LEGEND}\n", *pipes(header, ([f"`{task}`", *cells] for task, *cells in rows)), ""]
+    if board.left_out:
+        parts += ["Left out:", "", *(f"- {run}" for run in board.left_out), ""]
+    for heading, groups in _by_heading(board).items():
+        parts += _section(heading, groups)
+    return text[:start] + "\n" + "\n".join(parts) + "\n" + text[end:]
 
 
-def _section(section: Section) -> Iterator[str]:
-    name = section.title
-    runs = [run.result for group in section.groups for run in group.runs]
-    cpus = sorted({run.hardware["cpu"] for run in runs})
-    marks = {cpu: f" ({'abcdefgh'[number]})" if cpus[1:] else "" for number, cpu in enumerate(cpus)}
-    days = sorted({run.finished[:10] for run in runs})
-    yield f"## {', '.join(tasks_by_heading(section.tasks))} (`{name}`)\n"
-    yield f"`ba-torchrl benchmark benchmark={name} threads=1 jobs=2`;"
-    yield f"{', '.join(cpu + mark for cpu, mark in marks.items())}; {days[0]} to {days[-1]}.\n"
-    yield f"![Success over updates](results/{name}.svg)\n"
-    yield f"| {' | '.join(HEADER)} |"
-    yield "|" + "---|" * len(HEADER)
-    before = ""
-    for group in section.groups:
-        for run in group.runs:
-            yield f"| {' | '.join(_cells(group, run, marks, is_first=group.task != before))} |"
-            before = group.task
+def _by_heading(board: Leaderboard) -> dict[str, list[Group]]:
+    """Return the rows of each group of tasks that has one."""
+    found = {
+        heading: [
+            board.cells[task, method]
+            for task in tasks
+            for method in board.methods
+            if (task, method) in board.cells
+        ]
+        for heading, tasks in tasks_by_heading(board.tasks).items()
+    }
+    return {heading: groups for heading, groups in found.items() if groups}
 
 
-def _cells(group: Group, run: Run, marks: dict[str, str], *, is_first: bool) -> list[str]:
-    """Return the row of a run; the first one of a task has its picture.
+def _figure(heading: str) -> str:
+    """Return the name of the figure of a group of tasks."""
+    return heading.split(":")[0].lower().replace(" ", "_") + ".svg"
 
-    Args:
-        marks: what stands behind the minutes, by processor.
-    """
-    result, task = run.result, group.task
-    final, score = result.final, describe(task).experts.get(result.config["env"]["robot"])
-    low, high = wilson_interval(round(final.success_rate * final.episodes), final.episodes)
-    success = f"{final.success_rate:.2f} ({low:.2f} to {high:.2f})"
+
+def _section(heading: str, groups: Sequence[Group]) -> Iterator[str]:
+    yield f"## {heading}\n"
+    if any(_has_curve(group) for group in groups):
+        yield f"![Success over environment steps](results/{_figure(heading)})\n"
+    yield from pipes(HEADER, map(_cells, groups))
+    yield ""
+
+
+def _has_curve(group: Group) -> bool:
+    return any(run.result.curve for run in group.runs)
+
+
+def _cells(group: Group) -> list[str]:
+    """Return the row of a task and a method; numbers of several runs are means."""
+    results, task = [run.result for run in group.runs], group.task
+    score = describe(task).experts.get(results[0].config["env"]["robot"])
     return [
         f"`{task}`",
-        f'<img src="gallery/{task.replace("/", "_")}.png" width="160">' if is_first else "",
+        f'<img src="gallery/{task.replace("/", "_")}.png" width="160">',
         "" if score is None else f"{score.success_rate:.2f}",
-        group.method + (", **shipped**" if _is_shipped(run) else ""),
-        str(result.seed),
-        success,
-        f"{final.mean_length:.1f}",
-        str(final.updates),
-        str(result.curve[-1].updates),
-        str(result.curve[-1].env_steps),
-        f"{result.seconds / 60:.0f}{marks[result.hardware['cpu']]}",
-        result.versions.get("commit", ""),
+        group.method,
+        cell_text(group),
+        _mean([result.best.success_rate for result in results], ".2f"),
+        _mean([result.last.mean_length for result in results], ".1f"),
+        _mean([result.demonstrations for result in results]),
+        _mean([result.env_steps for result in results]),
+        _mean([result.seconds and result.seconds / 60 for result in results]),
+        ", ".join(sorted({result.hardware["cpu"] for result in results})),
+        ", ".join(sorted({result.versions.get("commit", "") for result in results})),
     ]
 
 
-def _is_shipped(run: Run) -> bool:
-    """Return whether the policy that the package ships for the task is of this run."""
-    path = shipped_file(run.result.task)
-    if not path.exists():
-        return False
-    card = read_card(path)
-    same = (card.label, card.config["seed"], card.versions) == (
-        run.result.label,
-        run.result.seed,
-        run.result.versions,
-    )
-    return same and card.updates == run.result.final.updates
+def _mean(values: Sequence[float | None], form: str = ".0f") -> str:
+    """Return a mean as text, a dash where a value is not known."""
+    known = [value for value in values if value is not None]
+    return format(sum(known) / len(known), form) if len(known) == len(values) else "–"
 
 
 def main() -> None:
-    """Copy results, and write the page and its curves."""
+    """Add records, and write the page and its curves."""
     if sys.argv[1:]:
-        print(f"{copy(sys.argv[1:])} runs copied")
-    for section in sections():
-        plot_section(section, [FOLDER / f"{section.title}.svg"])
+        print(f"{add(sys.argv[1:])} records added")
+    for heading, groups in _by_heading(present()).items():
+        if any(_has_curve(group) for group in groups):
+            with_curve = [group for group in groups if _has_curve(group)]
+            plot_groups(with_curve, [FOLDER / _figure(heading)])
     PAGE.write_text(page_with_results(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 

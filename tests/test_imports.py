@@ -291,7 +291,7 @@ def test_requirements_fit_the_package():
                 pins[package.lower().replace("_", "-")] = version
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     extras = project["optional-dependencies"]
-    wanted = [*project["dependencies"], *extras["train"], *extras["report"], *extras["dev"]]
+    wanted = [*project["dependencies"], *extras["train"], *extras["dev"]]
     for requirement in wanted:
         package, bounds = re.fullmatch(r"([\w.-]+?)\s*((?:[<>=!~].*)?)", requirement).groups()
         pinned = pins[package.lower().replace("_", "-")]

@@ -21,6 +21,7 @@ DEMONSTRATIONS = "demos/pulling"
 SHORTER = {
     "agent.learn(10_000)": "agent.learn(120)",
     "n_eval_episodes=20": "n_eval_episodes=1",
+    "episodes=500)": "episodes=2)",
     "buffer_size=10_000": "buffer_size=200",
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 2,',
     '"mine/tall_block", 4)': '"mine/tall_block", 1)',
@@ -123,7 +124,7 @@ def test_command_line_of_a_page_is_valid(page, line, tmp_path, monkeypatch, cach
     if not words:  # the name of a command in the text
         assert name in command_names()
         return
-    if name in {"evaluate", "report", "export"}:  # the runs that they read
+    if name in {"evaluate", "report", "leaderboard", "export"}:  # the runs that they read
         for folder in [word for word in words if word.startswith("runs/")]:
             Path(folder).mkdir(parents=True)
     command = importlib.import_module(f"ba_torchrl.commands.{name}").COMMAND

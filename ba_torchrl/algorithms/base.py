@@ -69,16 +69,13 @@ class SeedUse(IntEnum):
     """Uses of randomness in a run.
 
     Initial weights and the actions that SAC samples are drawn from torch's global generator, which
-    is seeded with the seed of the run.
+    is seeded with the seed of the run. Tests have seeds of their own; see
+    `ba_torchrl.training.protocol`.
     """
 
     DEMONSTRATIONS = 0
     COLLECTION = 1
     EVALUATION = 2
-    REPORT = 3
-    """The last evaluation of a run, which is reported."""
-    TEST = 4
-    """Evaluations of a checkpoint after the run."""
     REPLAY = 5
     AUGMENTATION = 6
     EXPLORATION = 7

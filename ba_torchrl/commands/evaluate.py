@@ -9,11 +9,8 @@ ba-torchrl evaluate trained folder=runs/trained    # all that the package ships;
 
 from __future__ import annotations
 
-import hashlib
-import json
-from dataclasses import asdict, fields
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
@@ -26,18 +23,16 @@ from ba_torchrl.cli.types import (
     VectorSettings,
     VideoFile,
 )
-from ba_torchrl.config import Which
-from ba_torchrl.data.files import read_json, write_text
+from ba_torchrl.config import FIRST_TEST_SEED, Which
+from ba_torchrl.data.files import json_bytes, write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.record.results import wilson_interval
+from ba_torchrl.record.results import CITABLE_EPISODES, RunResult, TestedPolicy, wilson_interval
 from ba_torchrl.record.video import write_video
-from ba_torchrl.tasks.base import versions_of
 
 if TYPE_CHECKING:
     from tensordict import TensorDict
 
-    from ba_torchrl.training.evaluation import Evaluation
     from ba_torchrl.training.policy import TrainedPolicy
 
 
@@ -52,18 +47,18 @@ class EpisodeSettings(VectorSettings, PluginSettings):
     device: Text = "auto"
     """Where the policy is computed, whatever device it was trained on."""
     episodes: Count = 100
-    """Their number."""
-    seed: Seed | None = None
-    """Of the episodes; null for episodes that training did not use."""
+    """Their number. A number to cite has 500, at least 200."""
 
 
 class Settings(EpisodeSettings):
     """Settings of this command."""
 
+    seed: Seed | None = None
+    """Of the first of other episodes; null for those of the protocol, which training never used."""
     task: TaskId | None = None
     """Of policy=trained; null for all of them."""
     folder: OutputFolder | None = None
-    """Of policy=trained: a JSON file per policy, whose episodes are not played again."""
+    """Of policy=trained: the record of each policy as JSON, whose episodes are not played again."""
     expert: bool = False
     """Close loop: compare the policy's actions with the expert's, by component."""
     video: VideoFile | None = None
@@ -84,6 +79,8 @@ def main(settings: Settings) -> None:
         _evaluate(settings.policy, settings)
     elif settings.folder is not None and (settings.expert or settings.video is not None):
         raise ConfigError("folder: it keeps success and length; leave out expert and video")
+    elif settings.folder is not None and settings.seed is not None:
+        raise ConfigError("folder: it keeps records under the protocol; leave out seed")
     elif settings.task is not None:
         _evaluate(settings.task, settings)
     else:
@@ -96,27 +93,27 @@ def main(settings: Settings) -> None:
 def play(
     policy: TrainedPolicy,
     settings: EpisodeSettings,
+    seed: int = FIRST_TEST_SEED,
     episodes: list[TensorDict] | None = None,
     expert: bool = False,
-) -> Evaluation:
-    """Play greedy episodes in new environments.
+) -> TestedPolicy:
+    """Play greedy episodes in new environments, by default those of the protocol.
 
     Args:
         policy: acts.
         settings: of the episodes.
+        seed: of the first.
         episodes: which they are appended to.
         expert: add the expert's actions to them.
     """
     from ba_torchrl import make_vector_env
-    from ba_torchrl.training.evaluation import evaluate
+    from ba_torchrl.training.protocol import run_test
 
-    seed = policy.test_seed if settings.seed is None else settings.seed
     env = make_vector_env(
         policy.config.resolved_env,
         settings.num_envs,
         parallel=settings.parallel,
         register_modules=settings.plugins,
-        seed=seed,
         expert=expert,
     )
 
@@ -127,7 +124,7 @@ def play(
 
     try:
         with progress_bar(total=settings.episodes, unit="episode") as bar:
-            return evaluate(env, policy, settings.episodes, seed, on_episode)
+            return run_test(env, policy, policy.updates, settings.episodes, on_episode, seed)
     finally:
         env.close()
 
@@ -136,17 +133,18 @@ def _evaluate(source: str, settings: Settings) -> None:
     from ba_torchrl import load_policy
     from ba_torchrl.training.agreement import agreement_table, check_comparable
     from ba_torchrl.training.evaluation import record_episodes
+    from ba_torchrl.training.protocol import PROTOCOL
 
     policy = load_policy(source, settings.which, settings.device)
     if settings.expert:
         check_comparable(policy.task)
-    seed = policy.test_seed if settings.seed is None else settings.seed
+    seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
     episodes: list[TensorDict] = []
     if settings.folder is None:
-        found = play(policy, settings, episodes, settings.expert)
+        found = play(policy, settings, seed, episodes, settings.expert)
     else:
-        found = _kept(policy, settings, seed)
-    low, high = wilson_interval(found.successes, found.episodes)
+        found = _recorded(policy, settings).last
+    low, high = wilson_interval(sum(found.successes), found.episodes)
     print(
         f"success_rate {found.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "
         f"{found.episodes} episodes of {policy.task}, {found.mean_length:.1f} steps each"
@@ -156,11 +154,17 @@ def _evaluate(source: str, settings: Settings) -> None:
         low, high = card.interval
         print(
             f"  card      {card.success_rate:.2f} ({low:.2f} to {high:.2f}) over {card.episodes} "
-            "episodes"
+            f"episodes{'' if card.protocol else ', before protocol 1'}"
         )
     print(f"  policy    update {policy.updates}, {policy.source}")
-    chosen = ", none of which training used" if settings.seed is None else ""
-    print(f"  episodes  seed {seed}{chosen}")
+    if settings.seed is not None:
+        print(f"  episodes  seed {seed}, not those of the protocol")
+    elif found.is_citable:
+        print(f"  episodes  protocol {PROTOCOL}")
+    else:
+        print(
+            f"  episodes  protocol {PROTOCOL}; not citable: fewer than {CITABLE_EPISODES} episodes"
+        )
     resolved = policy.config.resolved_env
     if settings.expert:
         print(f"\n{agreement_table(episodes, resolved.actions.sequence)}")
@@ -169,33 +173,29 @@ def _evaluate(source: str, settings: Settings) -> None:
         print(f"  video     {write_video(settings.video, frames, fps=resolved.video_fps)}")
 
 
-def _kept(policy: TrainedPolicy, settings: Settings, seed: int) -> Evaluation:
-    """Return the evaluation that a file of the folder holds, or play it and write that file.
+def _recorded(policy: TrainedPolicy, settings: Settings) -> RunResult:
+    """Return the record that a file of the folder holds, or play the test and write that file.
 
-    It is played again if the policy's file, the episodes or the version of the task are others.
+    It is played again if the policy's file, its card, the number of episodes, or a version of
+    protocol, task or packages is another. The commit alone makes no difference.
     """
-    from ba_torchrl.training.evaluation import Evaluation
+    from ba_torchrl.training.policy import policy_result
+
+    def key(record: RunResult) -> dict[str, object]:
+        packages = {name: each for name, each in record.versions.items() if name != "commit"}
+        whole = record.model_dump(exclude={"last", "best", "finished", "hardware"})
+        return {**whole, "versions": packages, "episodes": record.last.episodes}
 
     file = Path(settings.folder) / f"{policy.task.replace('/', '_')}.json"
-    asked: dict[str, Any] = {
-        "task": policy.task,
-        "label": policy.config.label,
-        "policy": hashlib.sha256(policy.source.read_bytes()).hexdigest(),
-        "seed": seed,
-        "episodes": settings.episodes,
-        "num_envs": settings.num_envs,
-        "task_version": versions_of(policy.task).task,
-    }
     try:
-        saved = dict(read_json(file))
-        if asked.items() <= saved.items():
-            return Evaluation(**{field.name: saved[field.name] for field in fields(Evaluation)})
-    except (OSError, ValueError, TypeError, KeyError):
+        saved = RunResult.model_validate_json(json_bytes(file))
+        if key(saved) == {**key(policy_result(policy, saved.last)), "episodes": settings.episodes}:
+            return saved
+    except (OSError, ValueError):
         pass  # there is none, or it is damaged
-    found = play(policy, settings)
-    interval = wilson_interval(found.successes, found.episodes)
-    write_text(file, json.dumps({**asked, **asdict(found), "interval": interval}, indent=2) + "\n")
-    return found
+    record = policy_result(policy, play(policy, settings))
+    write_text(file, record.model_dump_json() + "\n")
+    return record
 
 
 COMMAND = Command(main, Settings, positional="policy")

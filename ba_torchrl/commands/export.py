@@ -25,7 +25,7 @@ from ba_torchrl.config import changed
 from ba_torchrl.data.formats.base import FORMATS, card_file
 from ba_torchrl.errors import ConfigError
 
-_OF_POLICIES = ("which", "device", "episodes", "seed", "num_envs", "parallel")
+_OF_POLICIES = ("which", "device", "episodes", "num_envs", "parallel")
 
 
 class Settings(evaluate.EpisodeSettings):
@@ -41,8 +41,8 @@ class Settings(evaluate.EpisodeSettings):
     """New file or folder. Null for a policy's file named after the task."""
     device: Text = "cpu"
     """Where the policy is computed."""
-    episodes: int = Field(default=200, ge=1)
-    """Episodes of the policy's card."""
+    episodes: int = Field(default=500, ge=1)
+    """Episodes of the test on the policy's card."""
 
 
 def main(settings: Settings) -> None:
@@ -89,16 +89,7 @@ def _export_policy(source: str, settings: Settings) -> None:
     path = Path(settings.path or f"{policy.task.replace('/', '_')}{TENSORS}")
     check_writable_file(path, suffixes=(TENSORS,))
     round_weights(policy)
-    found = evaluate.play(policy, settings)
-    seed = policy.test_seed if settings.seed is None else settings.seed
-    card = save_policy(
-        policy,
-        path,
-        successes=found.successes,
-        episodes=found.episodes,
-        seed=seed,
-        num_envs=settings.num_envs,
-    )
+    card = save_policy(policy, path, evaluate.play(policy, settings))
     low, high = card.interval
     print(
         f"success_rate {card.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "

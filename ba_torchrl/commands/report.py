@@ -1,7 +1,7 @@
 """Report the results of runs: a folder with a page, curves, tables, values by seed and videos.
 
 ba-torchrl report runs/
-ba-torchrl report 'runs=[runs/close_loop_3d,runs/close_loop_4d]' folder=report axis=env_steps
+ba-torchrl report 'runs=[runs/close_loop_3d,runs/close_loop_4d]' folder=report axis=updates
 """
 
 from __future__ import annotations
@@ -33,8 +33,8 @@ class Settings(StrictModel):
     """A folder or a list of folders; the report holds all finished runs below them."""
     folder: OutputFolder | None = None
     """Of the report; null for "report" in the first of the other folders."""
-    axis: Axis = "updates"
-    """Of the curves: gradient updates, or steps of all environments."""
+    axis: Axis = "env_steps"
+    """Of the curves: steps of all environments, with those of demonstrations apart, or updates."""
 
 
 def main(settings: Settings) -> None:
@@ -48,7 +48,8 @@ def main(settings: Settings) -> None:
     )
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
-    print(f"  tables  {folder / 'table.csv'}, table.md, table.tex; by seed seeds.csv, curves.csv")
+    tables = "table.md, table.tex, comparisons.csv; by seed seeds.csv, curves.csv"
+    print(f"  tables  {folder / 'table.csv'}, {tables}")
 
 
 def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:

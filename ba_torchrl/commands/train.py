@@ -16,7 +16,7 @@ from typing import Any
 
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
-from ba_torchrl.record.results import CONFIG_FILE, NON_LEARNING_FIELDS
+from ba_torchrl.record.results import CITABLE_EPISODES, CONFIG_FILE, NON_LEARNING_FIELDS
 from ba_torchrl.training.config import ExperimentConfig
 
 logger = logging.getLogger(__name__)
@@ -50,19 +50,21 @@ def main(config: ExperimentConfig) -> None:
     except RunStopped as stopped:
         print(stopped, file=sys.stderr)
         raise
-    evaluation = result.evaluation
-    print(f"success_rate {evaluation.success_rate:.2f} over {evaluation.episodes} episodes")
+    last, best = result.last, result.best
+    remark = "" if last.is_citable else f", fewer than the {CITABLE_EPISODES} of a number to cite"
+    print(f"success_rate {last.success_rate:.2f} over {last.episodes} episodes{remark}")
     print(
-        f"  {config.report} policy, of update {result.updates}; "
-        f"{evaluation.mean_length:.1f} steps per episode; {result.seconds / 60:.1f} minutes"
+        f"  last policy, of update {last.updates}; {last.mean_length:.1f} steps per episode; "
+        f"{result.seconds / 60:.1f} minutes"
     )
+    print(f"  best        {best.success_rate:.2f}, the checkpoint of update {best.updates}")
     print(f"  curve       {result.curve}")
     if result.video is not None:
         print(f"  video       {result.video}")
     print(f"  checkpoint  {result.checkpoint}")
     print(f"  result      {result.record}")
     print("  to use it in Python:")
-    print(f'    policy = ba_torchrl.load_policy("{config.run_dir}")')
+    print(f'    policy = ba_torchrl.load_policy("{config.run_dir}", which="latest")  # or "best"')
     print("    env = policy.make_env()")
     print("    env.rollout(env.max_steps, policy)")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -22,6 +23,9 @@ RESULT_KEYS = (keys.REWARD, keys.SUCCESS, keys.FAULT, keys.TERMINATED, keys.TRUN
 """Entries of a step that hold the result of an episode."""
 LEAST_KEPT = 0.1
 """Least fraction of the episodes that must be kept."""
+
+FAULTY_ATTEMPTS = 3
+"""Attempts at an episode of a given seed until a fault is a failure."""
 
 
 def quotas(episodes: int, num_envs: int) -> list[int]:
@@ -74,8 +78,7 @@ def collect_episodes(
     while any(len(done) < quota for done, quota in zip(finished, wanted, strict=True)):
         step, state = env.step_and_maybe_reset(policy(state))
         if results_only:
-            results = ((keys.NEXT, key) for key in RESULT_KEYS)
-            step = step.select(keys.ACTION, keys.EXPERT_ACTION, *results, strict=False)
+            step = _results(step)
         for i, transition in enumerate(step.unbind(0)):
             if len(finished[i]) == wanted[i]:
                 continue
@@ -104,6 +107,84 @@ def collect_episodes(
                     "take failed ones too, less noise or another source"
                 )
     return [episode for done in finished for episode in done]
+
+
+@torch.no_grad()
+def play_seeds(
+    env: EnvBase,
+    policy: Policy,
+    seeds: Sequence[int],
+    on_episode: Callable[[TensorDict], None] | None = None,
+) -> list[TensorDict]:
+    """Play the episode of each seed, in which all objects are new.
+
+    An environment that has ended an episode takes the next seed. An episode with a fault is played
+    again, at most `FAULTY_ATTEMPTS` times in all; the last attempt is then a failed episode.
+
+    Args:
+        env: a vector of environments, batch size [num_envs].
+        policy: writes the action.
+        seeds: of the episodes.
+        on_episode: called with each episode when it ends, for progress bars.
+
+    Returns:
+        Episodes as TensorDicts [T] with the actions and the entries of `RESULT_KEYS`, in the order
+        of ``seeds``.
+
+    Raises:
+        ConfigError: a trained policy is for another environment.
+    """
+    check_policy(policy, env)
+    (num_envs,) = env.batch_size
+    waiting = deque((number, 1) for number in range(len(seeds)))
+    current: list[tuple[int, int] | None] = [None] * num_envs
+    steps: list[list[TensorDict]] = [[] for _ in current]
+    finished: dict[int, TensorDict] = {}
+    state: TensorDictBase | None = None
+    while len(finished) < len(seeds):
+        idle = [i for i, playing in enumerate(current) if playing is None]
+        begins = idle[: len(waiting)]
+        if begins:
+            options: list[dict[str, Any]] = [{} for _ in current]
+            for i in begins:
+                current[i] = waiting.popleft()
+                options[i] = {"seed": seeds[current[i][0]]}
+            if state is not None:  # the first reset is of all environments
+                state.set("_reset", _mask(begins, num_envs))
+            state = env.reset(state, list_of_kwargs=options)
+        playing = [i for i, each in enumerate(current) if each is not None]
+        step = env.step(policy(state).set("_step", _mask(playing, num_envs).squeeze(-1)))
+        state = step[keys.NEXT]
+        for i, transition in enumerate(_results(step).unbind(0)):
+            if current[i] is None:
+                continue
+            steps[i].append(transition.clone())
+            following = transition[keys.NEXT]
+            if not following[keys.DONE]:
+                continue
+            (number, attempt), current[i] = current[i], None
+            episode, steps[i] = torch.stack(steps[i]), []
+            if following[keys.FAULT] and attempt < FAULTY_ATTEMPTS:
+                logger.warning("the episode of seed %d had a fault and is repeated", seeds[number])
+                waiting.appendleft((number, attempt + 1))
+                continue
+            finished[number] = episode
+            if on_episode is not None:
+                on_episode(episode)
+    return [finished[number] for number in range(len(seeds))]
+
+
+def _results(step: TensorDictBase) -> TensorDictBase:
+    """Return the actions of a step and the entries of `RESULT_KEYS`."""
+    results = ((keys.NEXT, key) for key in RESULT_KEYS)
+    return step.select(keys.ACTION, keys.EXPERT_ACTION, *results, strict=False)
+
+
+def _mask(indices: Sequence[int], num_envs: int) -> torch.Tensor:
+    """Return which environments are among some, [num_envs, 1]."""
+    mask = torch.zeros(num_envs, 1, dtype=torch.bool, device="cpu")
+    mask[list(indices)] = True
+    return mask
 
 
 def is_success(episode: TensorDictBase) -> bool:

@@ -6,7 +6,7 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
@@ -30,6 +30,17 @@ _MOST_MARKERS = 25
 _LABEL_PT = 7
 _LABEL_WIDTH = 24
 """Characters in a line of a label beside a panel."""
+
+
+class Learning(NamedTuple):
+    """A method in a panel."""
+
+    curve: Curve
+    """As for `plot_learning_curve`."""
+    runs: Sequence[Curve] = ()
+    """(x, y) of each run, drawn as thin lines."""
+    demonstration_steps: float = 0.0
+    """Length of a dotted line to the left of 0."""
 
 
 def plot_learning_curve(
@@ -69,7 +80,7 @@ def plot_learning_curve(
 
 
 def plot_panels(
-    panels: Mapping[str, Mapping[str, Curve]],
+    panels: Mapping[str, Mapping[str, Learning]],
     paths: Sequence[str | Path],
     *,
     names: Sequence[str],
@@ -81,7 +92,7 @@ def plot_panels(
     The labels of the curves are at the right of each panel, beside their last points.
 
     Args:
-        panels: curves as for `plot_learning_curve`, by title.
+        panels: methods by name, by title.
         paths: of the figure in several formats, such as ``.svg`` and ``.pdf``.
         names: names of all curves, in the order of colours and markers; a name has the same ones in
             all panels.
@@ -103,16 +114,29 @@ def plot_panels(
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
         ends = []
-        for name, curve in curves.items():
-            line = _draw(axes, list(names).index(name), name, curve)
+        for name, method in curves.items():
+            line = _draw(axes, list(names).index(name), name, method.curve)
+            thin = {"color": line.get_color(), "linewidth": 0.5, "alpha": 0.6}
+            for run in method.runs:
+                axes.plot(*run, **thin)
+            if method.demonstration_steps and line.get_xdata().size:
+                (x, y), *_ = line.get_xydata()
+                before = [-method.demonstration_steps, x], [y, y]
+                axes.plot(*before, color=line.get_color(), linewidth=1.0, linestyle=":")
             label = "\n".join(labels[name])
             ends += [(x, y, line, label) for x, y in line.get_xydata()[-1:]]
         _label(axes, ends, gap_in / height_in)
         axes.set_title(title, fontsize=10)
-        axes.set_xlim(left=0)
+        before = max((method.demonstration_steps for method in curves.values()), default=0)
+        axes.set_xlim(left=-1.05 * before)
+        if before:
+            axes.axvspan(-1.05 * before, 0, color="0.95", zorder=0)
+            axes.xaxis.set_major_formatter(lambda x, _: f"{abs(x):g}")
         _style_axes(axes, (0.0, 1.0))
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
+    demonstrated = any(each.demonstration_steps for of in panels.values() for each in of.values())
+    xlabel += "; dotted, left of 0: steps of demonstrations" if demonstrated else ""
     figure.supxlabel(xlabel, fontsize=10)
     figure.supylabel(ylabel, fontsize=10)
     for path in paths:

@@ -15,42 +15,63 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from jinja2 import Environment
 
 from ba_torchrl.data.files import replaced, write_text
-from ba_torchrl.record.plots import plot_panels
-from ba_torchrl.record.results import now, why_unfinished
+from ba_torchrl.record.plots import Learning, plot_panels
+from ba_torchrl.record.results import CITABLE_EPISODES, now, why_unfinished
+from ba_torchrl.record.statistics import CONFIDENCE
 from ba_torchrl.record.summary import (
-    CONFIDENCE,
+    DIRECTION,
     ENOUGH_SEEDS,
     GOOD_RATE,
+    POOLED,
     Axis,
     Changes,
     Completed,
+    Group,
     Run,
     Section,
+    compare,
     differing_settings,
     load_sections,
     summarize,
 )
 
 _NUMBERS = {
-    "mean": ("success_mean", ".3f"),
-    "mean of the curve": ("curve_mean", ".3f"),
+    "best": ("best", ".3f"),
+    "area": ("area", ".3f"),
     f"updates to {GOOD_RATE:.0%}": ("updates_to_80", ".0f"),
     f"steps to {GOOD_RATE:.0%}": ("env_steps_to_80", ".0f"),
     "episode length": ("mean_length", ".1f"),
     "hours per run": ("hours", ".2f"),
 }
 """Column of the table and format of each number, by its heading."""
-_HEADER = ("task", "method", "seeds", "success (IQM)", f"{CONFIDENCE:.0%} interval", *_NUMBERS)
-_AXES: dict[Axis, str] = {"updates": "updates", "env_steps": "environment steps"}
+_INTERVAL = f"{CONFIDENCE:.0%} interval"
+_HEADER = ("task", "method", "seeds", "episodes", "success", _INTERVAL, *_NUMBERS)
+_COMPARISONS_HEADER = (
+    "task",
+    "first",
+    "second",
+    "seeds",
+    "difference",
+    _INTERVAL,
+    "P(first is better)",
+    _INTERVAL,
+    "",
+)
+_AXES: dict[Axis, str] = {"env_steps": "environment steps", "updates": "updates"}
 _FORMATS = (".svg", ".pdf")
 _DEFINITIONS = (
-    "Success rate of the greedy policy: interquartile mean (IQM) over seeds, for all tasks over "
-    f"seeds and tasks. Intervals and shading, {CONFIDENCE:.0%}: bootstrap over seeds, stratified "
-    "by task; for a single run, and where all runs have the same rate, Wilson's over their "
-    f"episodes. To {GOOD_RATE:.0%}: when the curve first reaches that rate."
+    "Success: mean over seeds of the success rates of the last policies in their test episodes, of "
+    "the greedy policy; for all tasks the mean over tasks. Best: of the checkpoints with the best "
+    f"evaluation. Intervals and shading, {CONFIDENCE:.0%}: hierarchical bootstrap over seeds and "
+    "test scenes, stratified by task, never narrower than Wilson's of one run; that of a single "
+    "run does not contain the spread over seeds. Area: mean success of the evaluations during "
+    "training over environment steps, to the last step of all methods on the task. To "
+    f"{GOOD_RATE:.0%}: when the mean curve first reaches that rate. Differences are paired by seed "
+    "and test scene; P is the probability that a run of the first method has the higher success."
 )
 _SETTINGS_HEADER = ("setting", "value", "methods")
 
@@ -59,7 +80,7 @@ def write_report(
     roots: Sequence[str | Path],
     folder: str | Path,
     *,
-    axis: Axis = "updates",
+    axis: Axis = "env_steps",
     changes: Changes = lambda _: {},
     completed: Completed = lambda run: run,
 ) -> Path:
@@ -81,6 +102,8 @@ def write_report(
     left_out = [f"{_relative(path, folder)}: {why_unfinished(path)}" for path in unfinished]
     parts = [_part(section, folder, axis) for section in sections]
     _write_csv(folder / "table.csv", (row for part in parts for row in part["table"]))
+    rows = [row for part in parts for row in part["comparisons"]]
+    _write_csv(folder / "comparisons.csv", rows)
     runs = [named for section in sections for named in _by_seed(section)]
     _write_csv(folder / "seeds.csv", ({**names, **_final(run)} for run, names in runs))
     points = ({**names, **p.model_dump()} for run, names in runs for p in run.result.curve)
@@ -95,22 +118,45 @@ def write_report(
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
     texts = {"definitions": _DEFINITIONS, "unfinished": left_out, "made": now()}
     headers = {"header": _HEADER, "settings_header": _SETTINGS_HEADER}
+    headers["comparisons_header"] = _COMPARISONS_HEADER
     return write_text(folder / "report.html", page.render(sections=parts, **texts, **headers))
 
 
-def plot_section(
-    section: Section, paths: Sequence[Path], axis: Axis = "updates", task: str | None = None
+def plot_groups(
+    groups: Sequence[Group],
+    paths: Sequence[Path],
+    axis: Axis = "env_steps",
+    methods: Sequence[str] | None = None,
 ) -> None:
-    """Plot the curves of every method with their intervals, a panel for each task or for one."""
-    panels: dict[str, dict[str, Any]] = {each: {} for each in section.tasks}
-    for group in section.groups:
-        found, x = group.estimate, group.axis(axis)
-        curve = [values[:-1] for values in (found.value, found.low, found.high)]
-        panels[group.task][group.method] = (x, *curve)
+    """Plot the curves of every method with their intervals and seeds, a panel for each task.
+
+    Over environment steps, dotted lines from the left to 0 are steps of demonstrations.
+
+    Args:
+        groups: see `ba_torchrl.record.summary.grouped`.
+        paths: of the figure in several formats.
+        axis: of the curves.
+        methods: in the order of colours; those of the groups if None.
+    """
+    panels: dict[str, dict[str, Learning]] = {group.task: {} for group in groups}
+    for group in groups:
+        x, curve = group.axis(axis), group.curve
+        if len(set(x)) == 1:  # as without steps but demonstrations
+            x, curve = x[-1:], [values[-1:] for values in curve]
+        runs = [
+            ([getattr(point, axis) for point in points], [point.success_rate for point in points])
+            for points in (run.result.curve for run in group.runs)
+        ]
+        demonstrations = [run.result.demonstration_steps or 0 for run in group.runs]
+        panels[group.task][group.method] = Learning(
+            (x, *curve),
+            runs if runs[1:] and x.size > 1 else (),
+            float(np.mean(demonstrations)) if axis == "env_steps" else 0.0,
+        )
     plot_panels(
-        panels if task is None else {task: panels[task]},
+        panels,
         paths,
-        names=section.methods,
+        names=methods or sorted({group.method for group in groups}),
         xlabel=_AXES[axis],
         ylabel="success rate",
     )
@@ -121,11 +167,12 @@ def plot_section(
 
 def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
     """Draw the figures of a section; return what the texts have of it."""
-    name, table = _file_name(section.title), summarize(section)
-    plot_section(section, [folder / f"{name}{end}" for end in _FORMATS], axis)
+    name, table, comparisons = _file_name(section.title), summarize(section), compare(section)
+    plot_groups(section.groups, [folder / f"{name}{end}" for end in _FORMATS], axis)
     panels = {task: f"{name}/{_file_name(task)}" for task in section.tasks}
     for task, stem in panels.items():
-        plot_section(section, [folder / f"{stem}{end}" for end in _FORMATS], axis, task)
+        of_task = [group for group in section.groups if group.task == task]
+        plot_groups(of_task, [folder / f"{stem}{end}" for end in _FORMATS], axis, section.methods)
     return {
         "title": section.title,
         "name": name,
@@ -134,6 +181,8 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
         "panels": panels,
         "table": table,
         "rows": [_cells(row) for row in table],
+        "comparisons": comparisons,
+        "compared": [_compared(row) for row in comparisons],
         "settings": differing_settings(section),
         "videos": _videos(section, folder),
         "machines": _machines(section),
@@ -142,9 +191,7 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
 
 def _note(section: Section) -> str:
     """Return which policies the numbers are of, and where the curves start."""
-    runs = [run.result for run, _ in _by_seed(section)]
-    policies = " or ".join(sorted({run.final.policy for run in runs}))
-    text = f"The table has the {policies} policy of each run, on episodes that did not select it."
+    text = "The table has the last policy of each run, on episodes that did not select it."
     starts = (int(update) for group in section.groups for update in group.axis("updates")[:1])
     first = sorted({*starts} - {0})
     if first:
@@ -163,22 +210,54 @@ def _warnings(section: Section) -> list[str]:
     texts = [f"Not the values of the benchmark: {'; '.join(found)}."] if found else []
     least = min(len(group.runs) for group in section.groups)
     if least < ENOUGH_SEEDS:
-        text = f"Fewer than {ENOUGH_SEEDS} seeds: methods cannot be ranked by these numbers."
-        single = " The interval of a single run does not contain the spread over seeds."
-        texts.append(text + (single if least == 1 else ""))
+        texts.append(
+            f"Fewer than {ENOUGH_SEEDS} seeds: {DIRECTION}; these numbers do not rank methods."
+        )
+    few = [f"{row.task}, {row.method}" for row in section.groups if not _is_citable(row)]
+    if few:
+        texts.append(
+            f"Tests with fewer than {CITABLE_EPISODES} episodes, not to be cited: {'; '.join(few)}."
+        )
+    if section.not_pooled:
+        texts.append(
+            f"Not pooled, as they differ in {' or '.join(POOLED)}: {'; '.join(section.not_pooled)}."
+        )
     return texts
+
+
+def _is_citable(group: Group) -> bool:
+    return all(test.is_citable for test in group.tests)
 
 
 def _cells(row: dict[str, Any]) -> list[tuple[str, Any]]:
     """Return the cells of a row: text, and the value by which rows are sorted."""
-    interval = "–" if math.isnan(row["low"]) else f"{row['low']:.3f} to {row['high']:.3f}"
     numbers = [(row[column], form) for column, form in _NUMBERS.values()]
     return [
-        *((str(row[name]), row[name]) for name in ("task", "method", "seeds")),
-        (f"{row['success_iqm']:.3f}", row["success_iqm"]),
-        (interval, row["low"]),
-        *(("–" if math.isnan(value) else format(value, form), value) for value, form in numbers),
+        *((str(row[name]), row[name]) for name in ("task", "method", "seeds", "episodes")),
+        (_text(row["success"]), row["success"]),
+        (_range(row["low"], row["high"]), row["low"]),
+        *((_text(value, form), value) for value, form in numbers),
     ]
+
+
+def _compared(row: dict[str, Any]) -> list[str]:
+    """Return the cells of a comparison."""
+    return [
+        *(str(row[name]) for name in ("task", "first", "second", "seeds")),
+        _text(row["difference"], "+.3f"),
+        _range(row["low"], row["high"], "+.3f"),
+        _text(row["improvement"], ".2f"),
+        _range(row["improvement_low"], row["improvement_high"], ".2f"),
+        row["reading"],
+    ]
+
+
+def _text(value: float, form: str = ".3f") -> str:
+    return "–" if math.isnan(value) else format(value, form)
+
+
+def _range(low: float, high: float, form: str = ".3f") -> str:
+    return "–" if math.isnan(low) else f"{low:{form}} to {high:{form}}"
 
 
 def _write_csv(path: Path, rows: Iterable[dict[str, Any]]) -> None:
@@ -202,20 +281,28 @@ def _final(run: Run) -> dict[str, Any]:
     result = run.result
     where = {name: result.hardware.get(name) for name in ("cpu", "gpu")}
     where |= {"commit": result.versions.get("commit"), "folder": run.folder}
-    return {**result.final.model_dump(), "hours": result.seconds / 3600, **where}
+    last = result.last
+    test = {name: getattr(last, name) for name in ("updates", "episodes", "success_rate")}
+    test["mean_length"] = last.mean_length
+    test["best_success_rate"] = result.best.success_rate
+    test |= {name: of(result) for name, of in POOLED.items()}
+    hours = None if result.seconds is None else result.seconds / 3600
+    return {**test, "hours": hours, **where}
 
 
 def _markdown(part: dict[str, Any]) -> str:
     lines = [f"## {part['title']}", "", part["note"]]
     lines += [line for text in part["warnings"] for line in ("", f"**{text}**")]
-    lines += ["", *_pipes(_HEADER, ([text for text, _ in row] for row in part["rows"]))]
+    lines += ["", *pipes(_HEADER, ([text for text, _ in row] for row in part["rows"]))]
+    if part["compared"]:
+        lines += ["", "Comparisons:", "", *pipes(_COMPARISONS_HEADER, part["compared"])]
     if part["settings"]:
         lines += ["", "Settings in which methods differ:", ""]
-        lines += _pipes(_SETTINGS_HEADER, part["settings"])
+        lines += pipes(_SETTINGS_HEADER, part["settings"])
     return "\n".join([*lines, "", *(f"- {machine}" for machine in part["machines"])])
 
 
-def _pipes(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+def pipes(header: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
     """Return the lines of a table in Markdown."""
     return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]
 

@@ -12,9 +12,10 @@ from collections.abc import Collection, Iterable, Mapping
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
+from typing_extensions import Self
 
 from ba_torchrl import __version__
 from ba_torchrl.config import StrictModel
@@ -24,6 +25,10 @@ RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"
 FAILURE_FILE = "failure.json"
 """Written by a benchmark into the folder of a run that failed: ``reason``, ``when``, ``log``."""
+CITABLE_EPISODES = 200
+"""Least number of test episodes of a number that can be cited."""
+Phase = Literal["demonstrations", "collection", "updates", "evaluation", "other"]
+"""Phase of a run. "other" is the start, the saving of states, and the video."""
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
 
 NON_LEARNING_FIELDS = frozenset(
@@ -67,23 +72,62 @@ class CurvePoint(StrictModel):
     """Mean steps per episode, failed episodes included."""
 
 
-class FinalEvaluation(StrictModel):
-    """The reported evaluation, on episodes that did not select the checkpoint."""
+class TestedPolicy(StrictModel):
+    """A greedy policy in the episodes of a test, which neither trained nor selected it."""
 
-    policy: Literal["last", "best"]
+    __test__: ClassVar[bool] = False  # no test of pytest
+
     updates: int
-    """Updates of the evaluated policy."""
-    episodes: int
-    success_rate: float
-    standard_error: float
-    mean_length: float
+    """Gradient updates of the policy."""
+    seeds: list[int]
+    """Seed of each episode. Episodes with the same seed share their objects, and are a cluster."""
+    successes: list[Literal[0, 1]]
+    """Whether each episode reached the goal."""
+    lengths: list[int]
+    """Steps of each episode."""
+
+    @model_validator(mode="after")
+    def _check_lengths(self) -> Self:
+        if not len(self.seeds) == len(self.successes) == len(self.lengths) > 0:
+            raise ValueError("every episode has a seed, a success and a length")
+        return self
+
+    @property
+    def episodes(self) -> int:
+        """Number of episodes."""
+        return len(self.seeds)
+
+    @property
+    def success_rate(self) -> float:
+        """Fraction of episodes that reached the goal."""
+        return sum(self.successes) / self.episodes
+
+    @property
+    def mean_length(self) -> float:
+        """Mean steps per episode, failed episodes included."""
+        return sum(self.lengths) / self.episodes
+
+    @property
+    def is_citable(self) -> bool:
+        """Whether there are at least `CITABLE_EPISODES` episodes."""
+        return self.episodes >= CITABLE_EPISODES
 
 
 class RunResult(StrictModel):
-    """Results and settings of a run."""
+    """Results and settings of a run, or the test of a policy from a file (``policy_file``).
 
-    format: Literal[1] = 1
+    Of a policy from a file, `last` and `best` are both that policy, there is no curve, precision
+    and hardware are those of the test, and what its card does not know of its training is None.
+    """
+
+    format: Literal[2] = 2
+    """1: rates without the outcomes of episodes."""
+    protocol: int
+    """Version of the protocol of the tests; see `ba_torchrl.training.protocol`."""
     task: str
+    task_version: int
+    expert_version: int | None
+    """None: no expert took part in the training, or it is unknown which."""
     label: str
     """Name of the method, such as "sacfd equi"."""
     benchmark: str | None
@@ -91,21 +135,42 @@ class RunResult(StrictModel):
     seed: int
     curve: list[CurvePoint]
     """Evaluations in the order of updates, the first of the untrained policy."""
-    final: FinalEvaluation
+    last: TestedPolicy
+    """The policy that training ends with: the main number."""
+    best: TestedPolicy
+    """The checkpoint with the best evaluation in `curve`, the newest of equal ones."""
+    policy_file: str | None = None
+    """SHA-256 of the file of the tested policy; None for a run."""
+    demonstrations: int | None
+    """Episodes of demonstrations."""
+    demonstration_steps: int | None
+    """Steps of these episodes."""
+    env_steps: int | None
+    """Steps of all environments, demonstrations and evaluations not counted."""
+    expert_labels: int | None
+    """States besides demonstrations that the expert labelled with its action."""
+    precision: str
+    """Number format in which the networks compute, "float32", "bfloat16" or "tf32"; "bfloat16, then
+    float32" of a run that was resumed on another machine."""
+    parameters: int
+    """Parameters of the acting policy."""
     config: dict[str, Any]
     """The run's configuration, defaults included."""
     versions: dict[str, str]
-    """Versions of Python and the packages."""
+    """Versions of Python and the packages, and the commit."""
     hardware: dict[str, Any]
     """`cpu`, `cores`, `memory_gb`, `gpu` (None on the CPU) and the learner's `threads`."""
-    seconds: float
+    seconds: float | None
     """Wall time of the run, without interruptions."""
+    phase_seconds: dict[Phase, float]
+    """What `seconds` is the sum of. Collection in other processes during updates is not counted."""
     resumed_at: list[int] = Field(default_factory=list)
     """Updates after which the run was resumed."""
     finished: str
     """Time of the end of the run, UTC, ISO 8601."""
     files: dict[str, str]
-    """Paths of `curve`, `checkpoint` and optionally `video`, relative to the run folder."""
+    """Paths of `curve`, `checkpoint` of the last policy, the `best` one and optionally `video`,
+    relative to the run folder."""
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:

@@ -1,11 +1,12 @@
-"""Statistics over seeds of finished runs, by benchmark, task and method.
+"""Tables of finished runs, by benchmark, task and method.
 
-Runs with different settings are not averaged; their methods get different names. Success rates are
-summarized by their interquartile mean (IQM) with a stratified bootstrap (Agarwal et al., 2021).
+Runs with different settings are not averaged; their methods get different names. The same holds
+for runs that differ in what `POOLED` names.
 """
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,51 +16,58 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
     CurvePoint,
-    FinalEvaluation,
     RunResult,
+    TestedPolicy,
     differences,
     flat,
     read_result,
     run_folders,
-    wilson_interval,
+)
+from ba_torchrl.record.statistics import (
+    Estimate,
+    area_under_success,
+    mean_curve,
+    mean_success,
+    paired_difference,
+    probability_of_improvement,
 )
 
 logger = logging.getLogger(__name__)
 
-Axis = Literal["updates", "env_steps"]
+Axis = Literal["env_steps", "updates"]
 Changes = Callable[[RunResult], Mapping[str, tuple[Any, Any]]]
 """From a run to the settings in which it differs from its benchmark: its value and the benchmark's,
 by name."""
 Completed = Callable[[RunResult], RunResult]
 """Fills in the defaults of settings that are newer than the run."""
 
-CONFIDENCE = 0.95
-RESAMPLES = 2000
+POOLED = {
+    "task version": lambda run: run.task_version,
+    "expert version": lambda run: run.expert_version,
+    "protocol": lambda run: run.protocol,
+    "precision": lambda run: run.precision,
+    "policy": lambda run: "of a run" if run.policy_file is None else "from a file",
+}
+"""What runs that are averaged have in common besides their settings, by name."""
+_OF_METHODS = ("protocol", "precision", "policy")
+"""Those by which methods are told apart on all tasks."""
 GOOD_RATE = 0.8
-"""Success rate of the IQM's curve for the measure of sample efficiency, updates to that rate."""
+"""Success rate of the mean curve for the measure of sample efficiency, steps to that rate."""
 ENOUGH_SEEDS = 5
-"""Least number of seeds from which intervals over seeds are reported without a warning."""
+"""Least number of seeds of a comparison that is more than a direction."""
+DIRECTION = "direction only"
 ALL_TASKS = "all tasks"
 OTHER_RUNS = "runs"
 """Title of the section of runs without a benchmark."""
 
 
 @dataclass(frozen=True)
-class Estimate:
-    """Interquartile means and their intervals at `CONFIDENCE`, each [n]."""
-
-    value: np.ndarray
-    low: np.ndarray
-    high: np.ndarray
-
-
-@dataclass(frozen=True)
 class Run:
-    """A finished run and its folder."""
+    """A finished run and its folder, or the file of its result."""
 
     folder: Path
     result: RunResult
@@ -93,26 +101,53 @@ class Group:
         return np.array([getattr(point, name) for point in longest])
 
     @cached_property
-    def estimate(self) -> Estimate:
-        """Success at the points of the curve and, last, in the final evaluation, [n + 1]."""
-        points = [
-            [*curve, run.result.final] for curve, run in zip(self.curves, self.runs, strict=True)
-        ]
-        rates = np.array([[[point.success_rate for point in curve]] for curve in points])
-        episodes = np.array([[[point.episodes for point in curve]] for curve in points])
-        return estimate(rates, episodes)
+    def curve(self) -> Estimate:
+        """Mean success at the points of the curve, [n]."""
+        rates, episodes = (
+            np.array([[getattr(point, name) for point in curve] for curve in self.curves])
+            for name in ("success_rate", "episodes")
+        )
+        return mean_curve(rates, episodes, np.random.default_rng(0))
+
+    @cached_property
+    def success(self) -> Estimate:
+        """Mean success of the tests of the last policies."""
+        return mean_success([self.tests], np.random.default_rng(0))
 
     @property
-    def by_seed(self) -> dict[int, FinalEvaluation]:
-        """Final evaluations by seed."""
-        return {run.result.seed: run.result.final for run in self.runs}
+    def tests(self) -> list[TestedPolicy]:
+        """Tests of the last policies."""
+        return [run.result.last for run in self.runs]
+
+    @property
+    def by_seed(self) -> dict[int, TestedPolicy]:
+        """Tests of the last policies by seed of the run."""
+        return {run.result.seed: run.result.last for run in self.runs}
+
+    @property
+    def env_steps(self) -> int:
+        """Environment steps at the last evaluation of the longest run."""
+        return max((point.env_steps for curve in self.curves for point in curve), default=0)
+
+    def area(self, end: int) -> float:
+        """Return the mean over runs of the area under success over environment steps.
+
+        Args:
+            end: last step of all runs that are compared.
+        """
+        return _mean(
+            area_under_success(
+                [point.env_steps for point in curve], [point.success_rate for point in curve], end
+            )
+            for curve in self.curves
+        )
 
     def reaches(self, rate: float) -> tuple[float, float]:
-        """Return the updates and environment steps at which the IQM's curve reaches a rate.
+        """Return the updates and environment steps at which the mean curve reaches a rate.
 
         Both are nan if it does not. The resolution is the interval between evaluations.
         """
-        reached = np.flatnonzero(self.estimate.value[:-1] >= rate)
+        reached = np.flatnonzero(self.curve.value >= rate)
         if not reached.size:
             return float("nan"), float("nan")
         steps = np.mean([curve[reached[0]].env_steps for curve in self.curves])
@@ -140,9 +175,52 @@ class Section:
         """Methods in alphabetical order."""
         return sorted({group.method for group in self.groups})
 
+    @property
+    def not_pooled(self) -> list[str]:
+        """Rows of a task and a label that differ in what `POOLED` names, and their folders."""
+        alike: dict[tuple[str, str], list[Group]] = {}
+        for group in self.groups:
+            alike.setdefault((group.task, group.runs[0].result.label), []).append(group)
+        return [
+            f"{row.task}, {row.method}: {', '.join(str(run.folder) for run in row.runs)}"
+            for rows in alike.values()
+            if any(_pooled(row.runs[0]) != _pooled(rows[0].runs[0]) for row in rows)
+            for row in rows
+        ]
+
+
+def load_runs(
+    roots: Iterable[str | Path], completed: Completed = lambda run: run
+) -> tuple[list[Run], list[Path]]:
+    """Read every finished run below some folders, and the folders of unfinished runs.
+
+    Folders with a damaged result are unfinished. Copies of a run are left out.
+
+    Raises:
+        FileNotFoundError: a folder is missing.
+    """
+    roots = [Path(root) for root in roots]
+    for root in roots:
+        if not root.is_dir():
+            raise FileNotFoundError(f"there is no folder {root}")
+    finished, unfinished = run_folders(roots)
+    runs: list[Run] = []
+    for folder in finished:
+        try:
+            run = Run(folder, completed(read_result(folder)))
+        except ValueError as error:
+            logger.warning("left out: %s", error)
+            unfinished.append(folder)
+            continue
+        if copied := [other.folder for other in runs if other.result == run.result]:
+            logger.warning("left out: %s is a copy of %s", folder, copied[0])
+        else:
+            runs.append(run)
+    return runs, unfinished
+
 
 def load_sections(
-    roots: Iterable[str | Path],
+    roots: Sequence[str | Path],
     changes: Changes = lambda _: {},
     completed: Completed = lambda run: run,
 ) -> tuple[list[Section], list[Path]]:
@@ -157,23 +235,7 @@ def load_sections(
         FileNotFoundError: a folder is missing, or none holds a finished run.
         ConfigError: runs have the same settings and seed, and are no copies.
     """
-    roots = [Path(root) for root in roots]
-    for root in roots:
-        if not root.is_dir():
-            raise FileNotFoundError(f"there is no folder {root}")
-    finished, unfinished = run_folders(roots)
-    runs = []
-    for folder in finished:
-        try:
-            run = Run(folder, completed(read_result(folder)))
-        except ValueError as error:
-            logger.warning("left out: %s", error)
-            unfinished.append(folder)
-            continue
-        if copied := [other.folder for other in runs if other.result == run.result]:
-            logger.warning("left out: %s is a copy of %s", folder, copied[0])
-        else:
-            runs.append(run)
+    runs, unfinished = load_runs(roots, completed)
     if not runs:
         raise FileNotFoundError(
             f"no finished run below {', '.join(map(str, roots))}: "
@@ -189,63 +251,43 @@ def load_sections(
             of_title = changed.setdefault(title, {})
             of_title.setdefault(name, set()).add((str(there), str(planned)))
     titles = sorted(by_title, key=lambda title: (title == OTHER_RUNS, title))
-    sections = [Section(each, _grouped(by_title[each]), changed.get(each, {})) for each in titles]
+    sections = [Section(each, grouped(by_title[each]), changed.get(each, {})) for each in titles]
     return sections, unfinished
 
 
-def estimate(rates: np.ndarray, episodes: np.ndarray) -> Estimate:
-    """Return the interquartile mean of success rates over seeds and tasks, with its interval.
+def grouped(runs: Iterable[Run]) -> list[Group]:
+    """Group runs that differ in their seed only, in the order of tasks and methods.
 
-    The interval is that of a bootstrap over seeds, stratified by task. Where all rates are equal,
-    as that of a single run is, it is Wilson's over the episodes of all. Where rates differ between
-    tasks and not between seeds, it is nan.
-
-    Args:
-        rates: [seeds, tasks, n].
-        episodes: number behind each rate, [seeds, tasks, n].
+    Methods with several settings get distinct names.
 
     Raises:
-        MissingPackageError: rates differ between seeds, and rliable is missing.
+        ConfigError: runs have the same settings and seed.
     """
-    value, total = _iqm(rates), episodes.sum((0, 1))
-    interval = np.full((2, value.size), np.nan)
-    for point in np.flatnonzero((rates == rates[:1, :1]).all((0, 1))):
-        successes = round(rates[0, 0, point] * total[point])
-        interval[:, point] = wilson_interval(successes, int(total[point]))
-    varies = (rates != rates[:1]).any((0, 1))
-    if varies.any():
-        interval[:, varies] = _bootstrap(rates[..., varies])
-    return Estimate(value, *interval)
-
-
-def _iqm(rates: np.ndarray) -> np.ndarray:
-    """Return the mean of the middle half of all rates, [seeds, tasks, n] -> [n].
-
-    It is `scipy.stats.trim_mean` of 25 %, which takes thirteen times as long.
-    """
-    ordered = np.sort(rates.reshape(-1, rates.shape[-1]), axis=0)
-    cut = len(ordered) // 4
-    return ordered[cut : len(ordered) - cut].mean(0)
-
-
-def _bootstrap(rates: np.ndarray) -> np.ndarray:
-    """Return the interval of the interquartile mean, [seeds, tasks, n] -> [2, n]."""
-    try:
-        from rliable.library import get_interval_estimates
-    except (ImportError, TypeError) as error:  # the latter from arch, if pandas is version 3
-        fix = install_command("rliable", "pandas<3")
-        raise MissingPackageError(
-            f"intervals over several seeds need the extra [report]: {fix}"
-        ) from error
-    state = np.random.get_state()  # noqa: NPY002, rliable draws from the global generator
-    np.random.seed(0)  # noqa: NPY002
-    try:
-        _, found = get_interval_estimates(
-            {"": rates}, _iqm, reps=RESAMPLES, confidence_interval_size=CONFIDENCE
+    named: dict[tuple[str, str], list[list[Run]]] = {}
+    for run in runs:
+        alike = named.setdefault((run.result.task, run.result.label), [])
+        for group in alike:
+            if not _differences(group[0], run):
+                group.append(run)
+                break
+        else:
+            alike.append([run])
+    groups, twice = [], []
+    for (task, label), alike in named.items():
+        of_label = [
+            group[0] for (_, name), other in named.items() if name == label for group in other
+        ]
+        for members in alike:
+            seeds = [run.result.seed for run in members]
+            where = [str(run.folder) for run in members if seeds.count(run.result.seed) > 1]
+            twice += [f"{task}, {label}: {', '.join(where)}"] if where else []
+            name = label + _distinction(members[0], [other[0] for other in alike], of_label)
+            groups.append(Group(task, name, sorted(members, key=lambda run: run.result.seed)))
+    if twice:
+        raise ConfigError(
+            f"runs with the same settings and seed: {'; '.join(twice)}; name the folders to report"
         )
-    finally:
-        np.random.set_state(state)  # noqa: NPY002
-    return found[""]
+    return sorted(groups, key=lambda group: (group.task, group.method))
 
 
 def differing_settings(section: Section) -> list[tuple[str, str, str]]:
@@ -256,7 +298,7 @@ def differing_settings(section: Section) -> list[tuple[str, str, str]]:
         names |= {name for other in others for name in _differences(first, other)}
     found: dict[tuple[str, str], set[str]] = {}
     for group in section.groups:
-        settings = flat(group.runs[0].result.config)
+        settings = flat(_settings(group.runs[0]))
         for name in names:
             value = str(settings.get(name, "–"))
             found.setdefault((name, value), set()).add(group.method)
@@ -267,98 +309,165 @@ def summarize(section: Section) -> list[dict[str, Any]]:
     """Return the table of a section: numbers by name, nan where there is none.
 
     There is a row per task and method, and for each method that ran on every task a row in which
-    the success is that over seeds and tasks.
+    the success is the mean over tasks.
     """
-    rows = [_row(section.title, group) for group in section.groups]
+    ends = {
+        task: max(group.env_steps for group in section.groups if group.task == task)
+        for task in section.tasks
+    }
+    rows = [_row(section.title, group, ends[group.task]) for group in section.groups]
     if len(section.tasks) == 1:
         return rows
-    for method in section.methods:
-        of_method = [group for group in section.groups if group.method == method]
-        shared = set.intersection(*(set(group.by_seed) for group in of_method))
-        if len(of_method) < len(section.tasks) or not shared:
-            continue
-        final = [[group.by_seed[seed] for group in of_method] for seed in sorted(shared)]
-        rates = np.array([[[each.success_rate] for each in row] for row in final])
-        episodes = np.array([[[each.episodes] for each in row] for row in final])
-        own = [row for row in rows if row["method"] == method and row["task"] != ALL_TASKS]
+    for method, of_method in _on_all_tasks(section).items():
+        own = [row for row in rows if row["method"] == method]
+        success = mean_success([group.tests for group in of_method], np.random.default_rng(0))
         rows.append(
             {
                 **dict.fromkeys(rows[0], float("nan")),
                 "benchmark": section.title,
                 "task": ALL_TASKS,
                 "method": method,
-                "seeds": len(shared),
-                **_success(estimate(rates, episodes), rates),
-                "curve_mean": float(np.mean([row["curve_mean"] for row in own])),
-                "hours": float(np.mean([row["hours"] for row in own])),
+                "seeds": min(row["seeds"] for row in own),
+                "episodes": min(row["episodes"] for row in own),
+                **_columns("success", success),
+                **{name: _mean(row[name] for row in own) for name in ("best", "area", "hours")},
             }
         )
     return rows
 
 
-def _row(title: str, group: Group) -> dict[str, Any]:
+def compare(section: Section) -> list[dict[str, Any]]:
+    """Return the comparisons of the methods of a section: numbers by name, nan where there is none.
+
+    There is a row per task and pair of methods, and a row of all tasks for each pair that ran on
+    every task. Runs are paired by seed, test episodes by scene.
+    """
+    rows = []
+    by_task = {
+        task: {group.method: group for group in section.groups if group.task == task}
+        for task in section.tasks
+    }
+    for task, groups in by_task.items():
+        for first, second in itertools.combinations(groups.values(), 2):
+            rows.append(_comparison(section.title, task, [(first, second)]))
+    if len(section.tasks) > 1:
+        for first, second in itertools.combinations(_on_all_tasks(section).values(), 2):
+            pairs = list(zip(first, second, strict=True))
+            rows.append(_comparison(section.title, ALL_TASKS, pairs))
+    return rows
+
+
+def _comparison(title: str, task: str, pairs: Sequence[tuple[Group, Group]]) -> dict[str, Any]:
+    """Return the row of two methods on one task, or on all tasks."""
+    nothing, seeds = Estimate(*[float("nan")] * 3), []
+    difference = improvement = nothing
+    obstacles = sorted({name for pair in pairs for name in _obstacles(*pair)})
+    if not obstacles:
+        tests, rates = [], []
+        for first, second in pairs:
+            shared = sorted(first.by_seed.keys() & second.by_seed.keys())
+            seeds.append(len(shared))
+            tests.append([[group.by_seed[seed] for seed in shared] for group in (first, second)])
+            rates.append([[test.success_rate for test in group.tests] for group in (first, second)])
+        difference = paired_difference(tests, np.random.default_rng(0))
+        improvement = probability_of_improvement(rates, np.random.default_rng(0))
+    least = min(seeds, default=0)
+    first, second = pairs[0]
+    return {
+        "benchmark": title,
+        "task": task,
+        "first": first.method,
+        "second": second.method,
+        "seeds": least,
+        **_columns("difference", difference),
+        **_columns("improvement", improvement, "improvement_"),
+        "reading": f"not compared: {', '.join(obstacles)}"
+        if obstacles
+        else DIRECTION
+        if least < ENOUGH_SEEDS
+        else "",
+    }
+
+
+def _obstacles(first: Group, second: Group) -> list[str]:
+    """Return why two methods on a task are not compared."""
+    found = [
+        f"other {name}"
+        for name in ("task version", "protocol")
+        if POOLED[name](first.runs[0].result) != POOLED[name](second.runs[0].result)
+    ]
+    if len({tuple(test.seeds) for test in (*first.tests, *second.tests)}) > 1:
+        found.append("other test episodes")
+    if not first.by_seed.keys() & second.by_seed.keys():
+        found.append("no seed in common")
+    return found
+
+
+def _on_all_tasks(section: Section) -> dict[str, list[Group]]:
+    """Return the groups of each method that ran on every task, in the order of tasks."""
+    found = {
+        method: [group for group in section.groups if group.method == method]
+        for method in section.methods
+    }
+    return {name: groups for name, groups in found.items() if len(groups) == len(section.tasks)}
+
+
+def _row(title: str, group: Group, end: int) -> dict[str, Any]:
     """Return the row of a task and a method."""
     results = [run.result for run in group.runs]
     updates, steps = group.reaches(GOOD_RATE)
-    curves = [point.success_rate for curve in group.curves for point in curve if point.updates]
+    hours = (
+        float("nan") if result.seconds is None else result.seconds / 3600 for result in results
+    )
     return {
         "benchmark": title,
         "task": group.task,
         "method": group.method,
         "seeds": len(results),
-        **_success(group.estimate, np.array([result.final.success_rate for result in results])),
-        "curve_mean": float(np.mean(curves)) if curves else float("nan"),
+        "episodes": min(test.episodes for test in group.tests),
+        **_columns("success", group.success),
+        "best": _mean(result.best.success_rate for result in results),
+        "area": group.area(end),
         "updates_to_80": updates,
         "env_steps_to_80": steps,
-        "mean_length": float(np.mean([result.final.mean_length for result in results])),
-        "hours": float(np.mean([result.seconds for result in results])) / 3600,
+        "mean_length": _mean(test.mean_length for test in group.tests),
+        "hours": _mean(hours),
     }
 
 
-def _success(found: Estimate, rates: np.ndarray) -> dict[str, float]:
-    """Return the columns on the final evaluations."""
-    names = ("success_iqm", "low", "high")
-    values = (found.value[-1], found.low[-1], found.high[-1])
-    return {
-        **dict(zip(names, map(float, values), strict=True)),
-        "success_mean": float(rates.mean()),
-    }
+def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:
+    return {name: found.value, f"{prefix}low": found.low, f"{prefix}high": found.high}
 
 
-def _grouped(runs: Sequence[Run]) -> list[Group]:
-    """Group runs by task, method and settings; methods with several settings get distinct names."""
-    named: dict[tuple[str, str], list[list[Run]]] = {}
-    for run in runs:
-        alike = named.setdefault((run.result.task, run.result.label), [])
-        for group in alike:
-            if not _differences(group[0], run):
-                group.append(run)
-                break
-        else:
-            alike.append([run])
-    groups = []
-    for (task, label), alike in named.items():
-        for members in alike:
-            seeds = [run.result.seed for run in members]
-            twice = {seed for seed in seeds if seeds.count(seed) > 1}
-            if twice:
-                where = ", ".join(str(run.folder) for run in members if run.result.seed in twice)
-                raise ConfigError(
-                    f"{task}, {label}: runs with the same settings and seed: {where}; name the "
-                    "folders to report"
-                )
-            name = label + _distinction(members[0], [other[0] for other in alike])
-            groups.append(Group(task, name, sorted(members, key=lambda run: run.result.seed)))
-    return sorted(groups, key=lambda group: (group.task, group.method))
+def _mean(values: Iterable[float]) -> float:
+    return float(np.mean(list(values)))
+
+
+def _pooled(run: Run) -> dict[str, Any]:
+    return {name: of(run.result) for name, of in POOLED.items()}
+
+
+def _settings(run: Run) -> dict[str, Any]:
+    return {**run.result.config, **_pooled(run)}
 
 
 def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
-    return differences(first.result.config, second.result.config, {*NON_LEARNING_FIELDS, "seed"})
+    return differences(_settings(first), _settings(second), {*NON_LEARNING_FIELDS, "seed"})
 
 
-def _distinction(run: Run, others: Sequence[Run]) -> str:
-    """Return the settings in which a run differs from others as text, " (env.obs_size 64)"."""
-    names = sorted({name for other in others for name in _differences(run, other)})
-    settings = flat(run.result.config)
-    values = [f"{name} {settings.get(name)}" for name in names]
+def _distinction(run: Run, alike: Sequence[Run], of_label: Sequence[Run]) -> str:
+    """Return what a run differs in from others as text, " (env.obs_size 64, protocol 1)".
+
+    Args:
+        alike: the first runs of the groups of its task and label.
+        of_label: those of its label on all tasks.
+    """
+    names = {name for other in alike for name in _differences(run, other)}
+    names |= {
+        name
+        for name in _OF_METHODS
+        if any(POOLED[name](other.result) != POOLED[name](run.result) for other in of_label)
+    }
+    settings = flat(_settings(run))
+    values = [f"{name} {settings.get(name)}" for name in sorted(names)]
     return f" ({', '.join(values)})" if values else ""

@@ -376,7 +376,8 @@ class Versions(NamedTuple):
     """Versions of a task and of its expert."""
 
     task: int
-    expert: int
+    expert: int | None
+    """None if it is not known."""
 
     def __str__(self) -> str:
         return f"task version {self.task}, expert version {self.expert}"

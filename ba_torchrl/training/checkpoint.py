@@ -63,23 +63,13 @@ class Checkpoints:
         """Whether there is a checkpoint of the policy after so many updates."""
         return any(step_of(path) == updates for path in self._rotation.checkpoints())
 
-    def latest(self) -> Path:
-        """Return the folder of the latest checkpoint whose files are whole.
+    def find(self, which: Which) -> Path:
+        """Return the folder of the latest or the best checkpoint; see `find_checkpoint`."""
+        return find_checkpoint(self._folder, which)
 
-        Raises:
-            ConfigError: there is none.
-        """
-        return find_checkpoint(self._folder, "latest")
-
-    def load_best(self) -> Path:
-        """Put the algorithm back to the checkpoint with the best evaluation; return its folder.
-
-        Raises:
-            ConfigError: there is none.
-        """
-        path = find_checkpoint(self._folder, "best")
+    def load(self, path: Path) -> None:
+        """Put the algorithm into the state of a checkpoint."""
         self._checkpoint.load(path)
-        return path
 
 
 def write_config(config: ExperimentConfig) -> None:

@@ -117,11 +117,9 @@ class ExperimentConfig(WorkerOptions):
     stop_at_success: float | None = Field(default=None, gt=0, le=1)
     """Success rate that ends the run when two evaluations in a row reach it; None for all updates.
     If it is set, every evaluation has other episodes."""
-    final_eval_episodes: int = Field(default=100, ge=1)
-    """Episodes of the last evaluation, which is reported; not in the appendix."""
-    report: Literal["last", "best"] = "last"
-    """The reported policy: the last one, or that of the checkpoint with the best evaluation. The
-    episodes of its evaluation differ from those that selected the checkpoint."""
+    final_eval_episodes: int = Field(default=500, ge=1)
+    """Episodes of the test at the end, of the last policy and, beside it, of the checkpoint with
+    the best evaluation; see docs/protocol.md. A number with fewer than 200 cannot be cited."""
     save_minutes: float = Field(default=10.0, gt=0)
     """Minutes after which the state for ``resume`` is saved, besides at every evaluation."""
     log_every: int = Field(default=50, ge=1)

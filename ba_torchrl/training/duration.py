@@ -1,13 +1,17 @@
-"""Expected duration of a run's updates, from its first ones."""
+"""Duration of a run by phase, and the expected duration of its updates, from its first ones."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import get_args
 
 import torch
 
 from ba_torchrl.algorithms.base import network_dtype
 from ba_torchrl.hardware import processor
+from ba_torchrl.record.results import Phase
 from ba_torchrl.training.config import ExperimentConfig
 
 WARM_UP_UPDATES = 5
@@ -15,15 +19,63 @@ WARM_UP_UPDATES = 5
 MEASURED_UPDATES = 15
 
 
+def precision(config: ExperimentConfig) -> str:
+    """Return the number format in which a run's networks compute on its device."""
+    device = config.torch_device
+    found = str(network_dtype(config.network_config, device)).removeprefix("torch.")
+    if found != "float32" or device.type != "cuda" or not torch.backends.cudnn.allow_tf32:
+        return found
+    has_tf32 = torch.cuda.get_device_capability(device)[0] >= 8
+    return "tf32" if has_tf32 else found
+
+
 def compute_path(config: ExperimentConfig) -> str:
     """Return the number format of a run's network and the hardware that computes it."""
     device = config.torch_device
-    number_format = str(network_dtype(config.network_config, device)).removeprefix("torch.")
+    number_format = precision(config)
     if device.type == "cuda":
         return f"{number_format} on {torch.cuda.get_device_name(device)}"
     if device.type == "cpu":
         return f"{number_format} on {processor()}, {torch.get_num_threads()} threads"
     return f"{number_format} on {device}"
+
+
+class PhaseClock:
+    """Wall time of a run by phase; its start is part of "other"."""
+
+    def __init__(self) -> None:
+        self._seconds: dict[Phase, float] = dict.fromkeys(get_args(Phase), 0.0)
+        self._phase: Phase = "other"
+        self._since = time.perf_counter()
+
+    @contextmanager
+    def phase(self, name: Phase) -> Iterator[None]:
+        """Context whose time is that of a phase and not of the one around it."""
+        before = self._phase
+        self._switch(name)
+        try:
+            yield
+        finally:
+            self._switch(before)
+
+    def add(self, seconds: Mapping[Phase, float]) -> None:
+        """Add the time of the run before an interruption."""
+        for name, value in seconds.items():
+            self._seconds[name] += value
+
+    def seconds(self) -> dict[Phase, float]:
+        """Return the time of each phase until now."""
+        self._switch(self._phase)
+        return dict(self._seconds)
+
+    def total(self) -> float:
+        """Return the time of all phases until now."""
+        return sum(self.seconds().values())
+
+    def _switch(self, name: Phase) -> None:
+        now = time.perf_counter()
+        self._seconds[self._phase] += now - self._since
+        self._phase, self._since = name, now
 
 
 class UpdateTimer:

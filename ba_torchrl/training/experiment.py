@@ -18,16 +18,17 @@ from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.data.episodes import mean_length, success_rate
 from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import ScalarLog, progress_bar
-from ba_torchrl.record.results import CurvePoint
+from ba_torchrl.record.results import CurvePoint, TestedPolicy
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
 from ba_torchrl.training.collection import gather_demonstrations, make_env, start_collection
 from ba_torchrl.training.collectors.base import Collection
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.duration import UpdateTimer, compute_path
+from ba_torchrl.training.duration import PhaseClock, UpdateTimer, compute_path, precision
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
 from ba_torchrl.training.persistence import RunLock
+from ba_torchrl.training.protocol import run_test
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
 
 logger = logging.getLogger(__name__)
@@ -74,7 +75,7 @@ class Experiment:
         """Whether the state can be saved: there is one, and no update is under way."""
         self._is_reporting = False
         """Whether the networks may be those of an earlier update; the last state is saved then."""
-        self._started = self._last_save = time.perf_counter()
+        self._clock, self._last_save = PhaseClock(), time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
     def run(self) -> Result:
@@ -83,7 +84,7 @@ class Experiment:
         Raises:
             RunStopped: SIGINT or SIGTERM was received, and the state is saved.
         """
-        self._started = self._last_save = time.perf_counter()
+        self._clock, self._last_save = PhaseClock(), time.perf_counter()
         for message in self.config.without_effect():
             logger.warning(message)
         with self._signals:  # which last until the state is saved
@@ -126,7 +127,7 @@ class Experiment:
         self._is_between_updates = True
         updates, progress = self.algorithm.updates, self._progress
         progress.resumed_at.append(updates)
-        self._started -= progress.seconds
+        self._clock.add(progress.phase_seconds)
         self._bar.update(updates)
         last = progress.curve[-1] if progress.curve else None
         if last and 0 < last.updates == updates and not self.checkpoints.has(updates):
@@ -141,11 +142,13 @@ class Experiment:
         self._is_between_updates = True
 
     def _store_demonstrations(self) -> None:
-        with self._phase("demonstrations"):
+        with self._phase("demonstrations"), self._clock.phase("demonstrations"):
             episodes = gather_demonstrations(
                 self.config, self.algorithm, lambda _: self._signals.check()
             )
-        self.algorithm.on_demonstrations(episodes)
+            self.algorithm.on_demonstrations(episodes)
+        self._progress.demonstrations = len(episodes)
+        self._progress.demonstration_steps = sum(map(len, episodes))
         self.log.write(
             0,
             {
@@ -157,6 +160,9 @@ class Experiment:
     def _learn(self) -> None:
         """Pretrain, then alternate collection and updates until the last update."""
         config, algorithm = self.config, self.algorithm
+        computed = precision(config)
+        if computed not in self._progress.precisions:
+            self._progress.precisions.append(computed)
         collects = config.algorithm_config.collects
         pretrain_updates = config.pretrain_updates if collects else config.total_updates
         with self._phase("pretraining"):
@@ -164,11 +170,13 @@ class Experiment:
                 self._update(algorithm.pretrain_update)
         if self._is_complete:
             return
-        self._collection = self._start_collection()
+        with self._clock.phase("collection"):
+            self._collection = self._start_collection()
         self._timer.restart()  # collection between updates takes time
         with self._phase("training"):
             while not self._take_pending_updates():
-                steps = self._store(next(self._collection))
+                with self._clock.phase("collection"):
+                    steps = self._store(next(self._collection))
                 if algorithm.replay_size >= config.min_replay:
                     self._progress.pending_updates = steps * config.updates_per_step
                 self._stop_or_save()
@@ -202,25 +210,28 @@ class Experiment:
         return all(point.success_rate >= target for point in last)
 
     def _finish(self) -> Result:
-        """Run the evaluation that is reported, on new episodes; write curve, video and record."""
+        """Test the last policy and the best checkpoint; write curve, video and record."""
         config, progress = self.config, self._progress
         if not progress.curve or progress.curve[-1].updates < self.algorithm.updates:
             self._evaluate_and_save()
-        checkpoint = self.checkpoints.latest()
+        latest, best_checkpoint = (self.checkpoints.find(which) for which in ("latest", "best"))
         self._is_reporting = True
-        if config.report == "best":
-            checkpoint = self.checkpoints.load_best()
-        updates = self.algorithm.updates
-        evaluation = self._evaluate(config.final_eval_episodes, SeedUse.REPORT)
-        self.log.write(updates, evaluation.scalars("final"))
-        curve = plot_curve(config, progress.curve)
+        last = best = self._test()
         with self._phase("video"):
             video = record_video(config, self._greedy)
-        seconds = time.perf_counter() - self._started
-        files = {"curve": curve, "checkpoint": checkpoint, "video": video}
-        record = write_record(config, evaluation, updates, progress, seconds, files)
+        if best_checkpoint != latest:
+            self.checkpoints.load(best_checkpoint)
+            best = self._test()
+            self.checkpoints.load(latest)
+        rates = {"final/success_rate": last.success_rate, "final/mean_length": last.mean_length}
+        self.log.write(last.updates, {**rates, "final/best_success_rate": best.success_rate})
+        curve = plot_curve(config, progress.curve)
+        progress.phase_seconds = self._clock.seconds()
+        seconds = sum(progress.phase_seconds.values())
+        files = {"curve": curve, "checkpoint": latest, "best": best_checkpoint, "video": video}
+        record = write_record(config, self.algorithm, last, best, progress, files)
         self._state.remove()
-        return Result(evaluation, updates, checkpoint, curve, video, record, seconds)
+        return Result(last, best, latest, curve, video, record, seconds)
 
     # -- parts -------------------------------------------------------------------------------
 
@@ -249,13 +260,16 @@ class Experiment:
         progress.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
+        if self.algorithm.config.imitates == "expert_everywhere":
+            progress.expert_labels += int((is_present & ~following[keys.FAULT]).sum())
         self.algorithm.extend(self.algorithm.to_transitions(data, is_demonstration=False))
         return progress.env_steps // self.config.num_envs - steps_before
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
         self._is_between_updates = False
-        scalars = take_update()
+        with self._clock.phase("updates"):
+            scalars = take_update()
         self._is_between_updates = True
         updates = self.algorithm.updates
         self._bar.update()
@@ -316,7 +330,7 @@ class Experiment:
         if self._seconds_per_update is None or len(self._progress.curve) > 3:
             return
         remaining = config.total_updates - updates
-        last = config.final_eval_episodes / config.eval_episodes
+        last = 2 * config.final_eval_episodes / config.eval_episodes
         evaluations = remaining // config.eval_every + last
         seconds = remaining * self._seconds_per_update + evaluations * seconds_per_evaluation
         logger.info("about %.0f minutes to the end, evaluations included", seconds / 60)
@@ -329,7 +343,7 @@ class Experiment:
 
     def _save(self) -> None:
         """Save the state, with the positions of the environments in their episodes."""
-        self._progress.seconds = time.perf_counter() - self._started
+        self._progress.phase_seconds = self._clock.seconds()
         if self._collection is not None:
             self._progress.positions = self._collection.get_positions()
         self._state.save(self.algorithm.updates)
@@ -357,12 +371,12 @@ class Experiment:
         # A run must not end because the same episodes succeed twice.
         trained = [point for point in progress.curve if point.updates]
         part = 0 if self.config.stop_at_success is None else len(trained)
-        evaluation = self._evaluate(self.config.eval_episodes, SeedUse.EVALUATION, part)
+        evaluation = self._evaluate(part)
         progress.curve.append(
             CurvePoint(
                 updates=updates,
                 env_steps=progress.env_steps,
-                seconds=time.perf_counter() - self._started,
+                seconds=self._clock.total(),
                 **asdict(evaluation),
             )
         )
@@ -372,11 +386,24 @@ class Experiment:
         if updates:
             self.checkpoints.save(updates, evaluation.success_rate)
 
-    def _evaluate(self, episodes: int, use: SeedUse, part: int = 0) -> Evaluation:
-        seed = self.config.derived_seed(use, part)
-        if self._eval_env is None:
-            self._eval_env = make_env(self.config, seed)
-        with self._phase("evaluation"):
-            return evaluate(
-                self._eval_env, self._greedy, episodes, seed, lambda _: self._signals.check()
-            )
+    def _evaluate(self, part: int = 0) -> Evaluation:
+        """Evaluate the policy during training."""
+        seed = self.config.derived_seed(SeedUse.EVALUATION, part)
+        with self._evaluating() as env:
+            episodes = self.config.eval_episodes
+            return evaluate(env, self._greedy, episodes, seed, lambda _: self._signals.check())
+
+    def _test(self) -> TestedPolicy:
+        """Test the policy under the protocol."""
+        updates, episodes = self.algorithm.updates, self.config.final_eval_episodes
+        with self._evaluating() as env:
+            return run_test(env, self._greedy, updates, episodes, lambda _: self._signals.check())
+
+    @contextmanager
+    def _evaluating(self) -> Iterator[EnvBase]:
+        """Context of the phase of evaluations, with their environments."""
+        with self._phase("evaluation"), self._clock.phase("evaluation"):
+            if self._eval_env is None:
+                seed = self.config.derived_seed(SeedUse.EVALUATION)
+                self._eval_env = make_env(self.config, seed)
+            yield self._eval_env

@@ -2,40 +2,48 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
-from ba_torchrl.algorithms.base import SeedUse
+from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.data.episodes import Policy
 from ba_torchrl.hardware import hardware
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
     CurvePoint,
-    FinalEvaluation,
     RunResult,
+    TestedPolicy,
     now,
     versions,
     write_result,
 )
 from ba_torchrl.record.video import write_video
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.evaluation import Evaluation, record_episodes
+from ba_torchrl.training.evaluation import record_episodes
+from ba_torchrl.training.protocol import PROTOCOL, count_parameters, test_seed
 from ba_torchrl.training.resume import Progress
 
 
 @dataclass(frozen=True)
 class Result:
-    """The last evaluation of a run, and the files that it wrote."""
+    """The tests of a run's policies, and the files that it wrote."""
 
-    evaluation: Evaluation
-    updates: int
-    """Updates of the evaluated policy."""
+    last: TestedPolicy
+    """The policy that training ended with."""
+    best: TestedPolicy
+    """The checkpoint with the best evaluation."""
     checkpoint: Path
+    """Of the last policy."""
     curve: Path
     video: Path | None
     record: Path
     """All of this and the whole curve as JSON; see `ba_torchrl.record.results`."""
     seconds: float
+
+    @property
+    def updates(self) -> int:
+        """Updates of the last policy."""
+        return self.last.updates
 
 
 def plot_curve(config: ExperimentConfig, curve: list[CurvePoint]) -> Path:
@@ -60,43 +68,53 @@ def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:
     """Record greedy episodes; return the file, None if the run wants no video."""
     if not config.video_episodes:
         return None
-    seed = config.derived_seed(SeedUse.REPORT)
-    frames = record_episodes(config.resolved_env, policy, config.video_episodes, seed)
+    frames = record_episodes(config.resolved_env, policy, config.video_episodes, test_seed(0))
     return write_video(config.folder / "evaluation.mp4", frames, fps=config.resolved_env.video_fps)
 
 
 def write_record(
     config: ExperimentConfig,
-    evaluation: Evaluation,
-    updates: int,
+    algorithm: Learner,
+    last: TestedPolicy,
+    best: TestedPolicy,
     progress: Progress,
-    seconds: float,
     files: dict[str, Path | None],
 ) -> Path:
     """Write the run's result as JSON; return the file.
 
     Args:
         config: of the run.
-        evaluation: the one that is reported.
-        updates: of the evaluated policy.
-        progress: learning curve and resumptions.
-        seconds: wall time of the run.
+        algorithm: whose policy was tested.
+        last: test of the policy that training ended with.
+        best: test of the checkpoint with the best evaluation.
+        progress: learning curve, counts and times.
         files: the run's other files by name; None for one that was not written.
     """
-    folder = config.folder.resolve()
+    folder, task = config.folder.resolve(), config.resolved_env.task_class
     return write_result(
         config.folder,
         RunResult(
+            protocol=PROTOCOL,
             task=config.task,
+            task_version=task.version,
+            expert_version=task.expert_version if uses_expert(config) else None,
             label=config.label,
             benchmark=config.benchmark,
             seed=config.seed,
             curve=progress.curve,
-            final=FinalEvaluation(policy=config.report, updates=updates, **asdict(evaluation)),
+            last=last,
+            best=best,
+            demonstrations=progress.demonstrations,
+            demonstration_steps=progress.demonstration_steps,
+            env_steps=progress.env_steps,
+            expert_labels=progress.expert_labels,
+            precision=", then ".join(progress.precisions),
+            parameters=count_parameters(algorithm.policy),
             config=config.resolved(),
             versions=versions(),
             hardware=hardware(config.torch_device),
-            seconds=seconds,
+            seconds=sum(progress.phase_seconds.values()),
+            phase_seconds=progress.phase_seconds,
             resumed_at=progress.resumed_at,
             finished=now(),
             files={
@@ -106,3 +124,12 @@ def write_record(
             },
         ),
     )
+
+
+def uses_expert(config: ExperimentConfig) -> bool:
+    """Return whether the task's expert plays demonstrations for a run, or labels its states.
+
+    Of demonstrations in a folder it is not known.
+    """
+    plays = config.demonstrations > 0 and config.demonstrations_path is None
+    return plays or config.algorithm_config.imitates == "expert_everywhere"

@@ -9,6 +9,7 @@ import logging
 import shlex
 import textwrap
 from collections.abc import Iterable, Mapping
+from hashlib import sha256
 from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
@@ -24,7 +25,7 @@ from torchrl.envs import EnvBase, TransformedEnv
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.algorithms.base import Learner, SeedUse
+from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.config import StrictModel, explain
 from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.envs import keys
@@ -32,7 +33,16 @@ from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.errors import ConfigError, known_names
-from ba_torchrl.record.results import RESULT_FILE, read_result, wilson_interval
+from ba_torchrl.hardware import hardware
+from ba_torchrl.record.results import (
+    RESULT_FILE,
+    RunResult,
+    TestedPolicy,
+    now,
+    read_result,
+    versions,
+    wilson_interval,
+)
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 from ba_torchrl.training.checkpoint import (
     Which,
@@ -43,6 +53,8 @@ from ba_torchrl.training.checkpoint import (
     read_versions,
 )
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
+from ba_torchrl.training.duration import precision
+from ba_torchrl.training.protocol import PROTOCOL, count_parameters
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +68,17 @@ _OF_TRAINING = {
 """Fields of a run that its policy does not need, with values that need no package or file."""
 
 
+_OF_RESULT = (
+    "expert_version",
+    "demonstrations",
+    "demonstration_steps",
+    "env_steps",
+    "expert_labels",
+    "hardware",
+    "versions",
+)
+"""Entries of a run's result that its policy's card has."""
+
 _OF_IMAGES = ("workspace", "in_hand_mode", "view_type", "view_scale")
 """Parameters of an environment that change the content of images and not their shape."""
 _WAY_OUT = "policy.make_env(), or a command without env.*, makes the environment of its training"
@@ -65,12 +88,10 @@ class PolicyCard(StrictModel):
     """What is known of a policy in a file."""
 
     format: Literal[3] = 3
-    """1: weights of kernels whose signs depended on the CPU. 2: no versions."""
+    """1: kernels whose signs depended on the CPU. 2: no versions, and episodes of other seeds."""
     task: str
     task_version: int
     """Of the training and of the episodes."""
-    expert_version: int
-    """Of the task's expert in the training."""
     label: str
     """Name of the method, such as "sacfd equi"."""
     config: dict[str, Any]
@@ -78,17 +99,27 @@ class PolicyCard(StrictModel):
     updates: int
     """Gradient updates of the policy."""
     success_rate: float
-    """Of greedy episodes that training did not use."""
+    """Of the policy's test, whose record is exact."""
     interval: tuple[float, float]
     """Wilson's interval of the success rate, 95 %."""
     episodes: int
-    """Number of these episodes."""
-    seed: int
-    """Of these episodes."""
+    """Number of episodes of the test."""
+    protocol: int | None = None
+    """Version of the protocol of the test; None for one before protocol 1, which is not citable."""
+    precision: str | None = None
+    """Number format of the networks in the test."""
     evaluate: str
-    """The command that plays them again, in the folder of the file."""
+    """The command that plays the test again, in the folder of the file."""
+    expert_version: int | None = None
+    """As in the run's result; None also if it is not known, likewise below."""
+    demonstrations: int | None = None
+    """Episodes of demonstrations."""
+    demonstration_steps: int | None = None
+    """Steps of these episodes."""
     env_steps: int | None = None
     """Environment steps of the run, demonstrations not counted."""
+    expert_labels: int | None = None
+    """States besides demonstrations that the expert labelled with its action."""
     minutes: float | None = None
     """Duration of the run."""
     hardware: dict[str, Any] = Field(default_factory=dict)
@@ -148,11 +179,6 @@ class TrainedPolicy(TensorDictModuleBase):
             for name, value in self.config.resolved_env.config
             if value != getattr(usual, name) and name not in SET_BY_THE_EXPERIMENT
         }
-
-    @property
-    def test_seed(self) -> int:
-        """Seed of episodes that training did not use."""
-        return self.config.derived_seed(SeedUse.TEST)
 
     def make_env(self, **changes: Any) -> BulletArmEnv:
         """Make the environment that the policy was trained in.
@@ -310,24 +336,13 @@ def round_weights(policy: TrainedPolicy) -> None:
             value.copy_(value.half())
 
 
-def save_policy(
-    policy: TrainedPolicy,
-    path: str | Path,
-    *,
-    successes: int,
-    episodes: int,
-    seed: int,
-    num_envs: int,
-) -> PolicyCard:
+def save_policy(policy: TrainedPolicy, path: str | Path, test: TestedPolicy) -> PolicyCard:
     """Write a policy and its card. Weights are stored in half precision.
 
     Args:
         policy: from a run, after `round_weights`.
         path: ends in ``.safetensors``; the card is beside it.
-        successes: of ``episodes`` greedy episodes.
-        episodes: number of episodes that were played.
-        seed: of these episodes.
-        num_envs: number of environments that played them.
+        test: of this very policy, under the protocol.
 
     Raises:
         ConfigError: another process writes the file, or it was trained in another version of its
@@ -340,37 +355,29 @@ def save_policy(
             f"the policy was trained in version {policy.versions.task} of {policy.task}, and its "
             f"episodes are of version {versions_of(policy.task).task}: train it again"
         )
-    run: dict[str, Any] = {}
+    run: dict[str, Any] = {"expert_version": policy.versions.expert}
     folder = policy.source.parent.parent
     if (folder / RESULT_FILE).exists():
         result = read_result(folder)
         run = {
             "minutes": round(result.seconds / 60, 1),
-            "env_steps": result.curve[-1].env_steps,
-            "hardware": result.hardware,
-            "versions": result.versions,
+            **{name: getattr(result, name) for name in _OF_RESULT},
         }
     config = policy.config.resolved()
     for name in ("run_dir", "resume", "device", *_OF_TRAINING):
         del config[name]
     is_shipped = path.resolve() == shipped_file(policy.task)
     words = ["policy=trained", f"task={policy.task}"] if is_shipped else [f"policy={path.name}"]
-    words += [f"{episodes=}", f"{num_envs=}"]
-    if seed != policy.test_seed:
-        words.append(f"{seed=}")
+    words.append(f"episodes={test.episodes}")
     if policy.config.plugins:
         words.append(f"plugins=[{','.join(policy.config.plugins)}]")
     card = PolicyCard(
         task=policy.task,
         task_version=policy.versions.task,
-        expert_version=policy.versions.expert,
         label=policy.config.label,
         config=config,
         updates=policy.updates,
-        success_rate=successes / episodes,
-        interval=wilson_interval(successes, episodes),
-        episodes=episodes,
-        seed=seed,
+        **_of_test(test, PROTOCOL, precision(policy.config)),
         evaluate=shlex.join(["ba-torchrl", "evaluate", *words]),
         **run,
     )
@@ -386,6 +393,64 @@ def save_policy(
         scratch.chmod(0o644)  # safetensors makes it readable for its owner alone
         write_text(scratch.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
     return card
+
+
+def _of_test(test: TestedPolicy, protocol: int, precision: str) -> dict[str, Any]:
+    """Return the fields of a card that a test determines."""
+    return {
+        "success_rate": test.success_rate,
+        "interval": wilson_interval(sum(test.successes), test.episodes),
+        "episodes": test.episodes,
+        "protocol": protocol,
+        "precision": precision,
+    }
+
+
+def tested_card(card: PolicyCard, record: RunResult) -> PolicyCard:
+    """Return a card with the number of the record of its policy's test."""
+    found = _of_test(record.last, record.protocol, record.precision)
+    episodes = f"episodes={record.last.episodes}"
+    command = card.evaluate.replace(f"episodes={card.episodes}", episodes)
+    return card.model_copy(update={**found, "evaluate": command})
+
+
+def policy_result(policy: TrainedPolicy, test: TestedPolicy) -> RunResult:
+    """Return the record of the test of a policy from a file, on this machine.
+
+    Args:
+        policy: from a file.
+        test: of the policy, under the protocol.
+    """
+    config, card = policy.config, policy.card
+    settings = config.resolved()
+    for name in ("run_dir", "resume", "device"):
+        del settings[name]
+    return RunResult(
+        protocol=PROTOCOL,
+        task=policy.task,
+        task_version=config.resolved_env.task_class.version,
+        expert_version=card.expert_version,
+        label=card.label,
+        benchmark=config.benchmark,
+        seed=config.seed,
+        curve=[],
+        last=test,
+        best=test,
+        policy_file=sha256(policy.source.read_bytes()).hexdigest(),
+        demonstrations=card.demonstrations,
+        demonstration_steps=card.demonstration_steps,
+        env_steps=card.env_steps,
+        expert_labels=card.expert_labels,
+        precision=precision(config),
+        parameters=count_parameters(policy.policy),
+        config=settings,
+        versions=versions(),
+        hardware=hardware(config.torch_device),
+        seconds=None if card.minutes is None else 60 * card.minutes,
+        phase_seconds={},
+        finished=now(),
+        files={},
+    )
 
 
 def read_card(path: str | Path) -> PolicyCard:

@@ -23,7 +23,7 @@ from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
-from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, differences
+from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, Phase, differences
 from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training.checkpoint import read_config, read_versions, write_config
 from ba_torchrl.training.config import ExperimentConfig
@@ -51,8 +51,15 @@ class Progress:
     """Whether each of the latest training episodes reached the goal."""
     env_steps: int = 0
     faults: int = 0
-    seconds: float = 0.0
-    """Wall time until the state was saved."""
+    demonstrations: int = 0
+    """Episodes of demonstrations."""
+    demonstration_steps: int = 0
+    expert_labels: int = 0
+    """States of the collection that the expert labelled and the replay stored."""
+    phase_seconds: dict[Phase, float] = field(default_factory=dict)
+    """Wall time by phase until the state was saved."""
+    precisions: list[str] = field(default_factory=list)
+    """Number formats in which the networks computed; several after a move to another machine."""
     resumed_at: list[int] = field(default_factory=list)
     """Updates after which the run was resumed."""
     pending_updates: int = 0

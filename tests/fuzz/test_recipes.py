@@ -22,6 +22,7 @@ WORK = {
     "train": "ba_torchrl.training.experiment.Experiment",
     "benchmark": "plan",
     "report": None,  # there is no finished run
+    "leaderboard": "package_runs",
     "plot": "read_config",
     "gallery": "expert_strip",
     "tasks": "task_page",

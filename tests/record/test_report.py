@@ -3,7 +3,6 @@ import html
 import json
 import re
 import shutil
-import statistics
 import subprocess
 import sys
 from html.parser import HTMLParser
@@ -14,18 +13,18 @@ import pytest
 
 from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import report
-from ba_torchrl.errors import ConfigError, MissingPackageError
-from ba_torchrl.record.plots import plot_panels
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import (
     RunResult,
+    TestedPolicy,
     differences,
     read_result,
     versions,
-    wilson_interval,
     write_result,
 )
-from ba_torchrl.record.summary import differing_settings, estimate, load_sections, summarize
+from ba_torchrl.record.summary import compare, differing_settings, load_sections, summarize
 from ba_torchrl.training import hydra_schema
 
 imageio = pytest.importorskip("imageio.v3")
@@ -36,9 +35,11 @@ UPDATES = (100, 200, 300)
 BLUE, ORANGE, GREEN = "#0072b2", "#d55e00", "#009e73"
 
 
-@pytest.fixture
-def rliable():
-    return pytest.importorskip("rliable")
+def policy_test(rate, seed=0, episodes=10):
+    successes = round(rate * episodes)
+    outcomes = [1] * successes + [0] * (episodes - successes)
+    lengths = [6 + seed] * episodes
+    return TestedPolicy(updates=300, seeds=range(episodes), successes=outcomes, lengths=lengths)
 
 
 def write_run(
@@ -65,14 +66,18 @@ def write_run(
             }
             for updates, rate in zip(updates, rates, strict=False)
         ],
-        "final": {
-            "policy": "last",
-            "updates": 300,
-            "episodes": 10,
-            "success_rate": rates[-1] if final is None else final,
-            "standard_error": 0.1,
-            "mean_length": 6.0 + seed,
-        },
+        "last": policy_test(rates[-1] if final is None else final, seed),
+        "best": policy_test(max(rates, default=final), seed),
+        "protocol": 1,
+        "task_version": 0,
+        "expert_version": 0,
+        "demonstrations": 5,
+        "demonstration_steps": 400,
+        "env_steps": 1500,
+        "expert_labels": 0,
+        "precision": "float32",
+        "parameters": 1000,
+        "phase_seconds": {"updates": 1800.0},
         "config": config,
         "versions": {"torch": "2.13.0", "ba_torchrl": "0.1.0", "commit": "abc"},
         "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gb": 8.0, "gpu": None, "threads": 2},
@@ -102,20 +107,19 @@ def test_curves_begin_with_the_untrained_policy_if_all_runs_have_its_evaluation(
     write_run(tmp_path / "new" / "seed0", (0.2, 0.5, 0.9), updates=(0, 100, 200))
     (section,), _ = load_sections([tmp_path])
     assert section.groups[0].axis("updates").tolist() == [0, 100, 200]
-    assert summarize(section)[0]["curve_mean"] == pytest.approx(0.7)  # of trained policies
+    assert summarize(section)[0]["area"] == pytest.approx(0.525)  # of 0.35 and 0.7
     write_report([tmp_path], tmp_path / "report")
     assert "Curves start" not in (tmp_path / "report" / "table.md").read_text()
     write_run(tmp_path / "old" / "seed1", (0.5, 0.9, 0.9), seed=1, updates=(100, 200, 300))
     (section,), _ = load_sections([tmp_path])
     (group,) = section.groups
     assert group.axis("updates").tolist() == [100, 200, 300]
-    assert group.estimate.value.tolist() == [0.5, 0.9, 0.9, 0.9]
+    assert group.curve.value.tolist() == [0.5, 0.9, 0.9]
     write_report([tmp_path], tmp_path / "report")
     text = (tmp_path / "report" / "table.md").read_text()
     assert "Curves start at the first evaluation, after 100 updates." in text
 
 
-@pytest.mark.usefixtures("rliable")
 def test_figures_over_seeds(tmp_path):
     curves = {0: (0.1, 0.8, 0.9), 1: (0.3, 0.9, 1.0), 2: (0.2, 0.6, 0.7), 3: (0.2, 0.7, 0.9)}
     for seed, rates in curves.items():
@@ -124,65 +128,16 @@ def test_figures_over_seeds(tmp_path):
     assert unfinished == []
     (row,) = summarize(section)
     assert (row["task"], row["method"], row["seeds"]) == (REACH, "sacfd equi", 4)
-    assert row["success_iqm"] == pytest.approx(0.9)  # without 0.7 and 1.0
-    assert row["success_mean"] == pytest.approx(0.875)
-    assert row["curve_mean"] == pytest.approx(statistics.mean(sum(curves.values(), ())))
-    # the curve is 0.2, 0.75, 0.9: at the last point it is beyond 0.8 for the first time
-    assert section.groups[0].estimate.value[:3] == pytest.approx([0.2, 0.75, 0.9])
+    assert row["success"] == pytest.approx(0.875)
+    # means of the halves: 0.2, 0.75 and 0.875
+    assert section.groups[0].curve.value == pytest.approx([0.2, 0.75, 0.875])
+    assert row["best"] == pytest.approx(0.875)
+    assert row["area"] == pytest.approx((0.475 + 0.8125) / 2, abs=0.001)
     assert row["updates_to_80"] == 300
     assert row["env_steps_to_80"] == pytest.approx(1501.5)
     assert row["mean_length"] == pytest.approx(7.5)
     assert row["hours"] == pytest.approx(0.65)
-    assert 0.7 - 1e-9 <= row["low"] < row["success_iqm"] < row["high"] <= 1.0 + 1e-9
-
-
-@pytest.mark.usefixtures("rliable")
-def test_the_interval_is_that_of_resampled_seeds_of_each_task():
-    rates = np.array([[[0.1], [0.7]], [[0.3], [0.9]]])  # two seeds of two tasks
-    before = np.random.get_state()[1].tolist()  # noqa: NPY002
-    found = estimate(rates, np.full((2, 2, 1), 10))
-    # Half of the larger rate of the first task and the smaller one of the second: 0.4 and 0.6 in
-    # 3 of 16 resamples each. Without strata 0.1 and 0.9 are in the interval.
-    assert (found.value, found.low, found.high) == (
-        pytest.approx([0.5]),
-        pytest.approx([0.4]),
-        pytest.approx([0.6]),
-    )
-    assert np.random.get_state()[1].tolist() == before  # noqa: NPY002
-
-
-@pytest.mark.parametrize("seeds", [1, 2, 3, 4, 5, 8, 11])
-def test_the_interquartile_mean_is_that_of_rliable(rliable, seeds):
-    from rliable.metrics import aggregate_iqm
-
-    rates = np.random.default_rng(seeds).uniform(size=(seeds, 3, 2))
-    found = estimate(rates, np.ones_like(rates)).value
-    assert found == pytest.approx([aggregate_iqm(rates[..., point]) for point in range(2)])
-
-
-def test_equal_rates_have_the_interval_of_their_episodes():
-    episodes = np.full((2, 1, 2), 50)
-    equal = np.broadcast_to([[[0.0, 0.9]]], (2, 1, 2))
-    one = estimate(equal[:1], episodes[:1])
-    assert (one.low[1], one.high[1]) == wilson_interval(45, 50)
-    two = estimate(equal, episodes)
-    assert (two.low[0], two.high[0]) == wilson_interval(0, 100)
-    assert two.high[0] > 0.01
-    tasks = estimate(np.array([[[0.2], [0.8]]]), np.full((1, 2, 1), 50))  # of a single seed
-    assert tasks.value == pytest.approx([0.5])
-    assert np.isnan([tasks.low, tasks.high]).all()
-
-
-def test_without_rliable_seeds_are_refused_and_a_single_run_is_not(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rliable.library", None)
-    write_run(tmp_path / "a", (0.1, 0.2, 0.3))
-    (section,), _ = load_sections([tmp_path])
-    (row,) = summarize(section)
-    assert (row["low"], row["high"]) == wilson_interval(3, 10)
-    write_run(tmp_path / "b", (0.1, 0.2, 0.4), seed=1)
-    (section,), _ = load_sections([tmp_path])
-    with pytest.raises(MissingPackageError, match=r"\[report\]: pip install .*rliable"):
-        summarize(section)
+    assert 0 < row["low"] < 0.7 < row["success"] < row["high"] <= 1  # ten episodes
 
 
 def test_a_rate_that_is_never_reached_gives_nan(tmp_path):
@@ -191,7 +146,6 @@ def test_a_rate_that_is_never_reached_gives_nan(tmp_path):
     assert np.isnan(summarize(section)[0]["updates_to_80"])
 
 
-@pytest.mark.usefixtures("rliable")
 def test_the_last_point_of_a_run_that_ended_early_stands_for_later_ones(tmp_path):
     for seed, rates in enumerate([(0.1, 0.5, 0.7), (0.9, 0.9)]):
         write_run(tmp_path / f"seed{seed}", rates, seed=seed)
@@ -199,12 +153,11 @@ def test_the_last_point_of_a_run_that_ended_early_stands_for_later_ones(tmp_path
     (group,) = section.groups
     assert group.axis("updates").tolist() == list(UPDATES)
     assert group.axis("env_steps").tolist() == [500, 1000, 1500]
-    assert group.estimate.value == pytest.approx([0.5, 0.7, 0.8, 0.8])
+    assert group.curve.value == pytest.approx([0.5, 0.7, 0.8])
     # at the last point the seeds have 1500 and 1001 steps
     assert group.reaches(0.8) == (300.0, 1250.5)
 
 
-@pytest.mark.usefixtures("rliable")
 def test_the_row_of_all_tasks_has_methods_that_ran_on_all_of_them(tmp_path):
     for seed, (limits, pick) in enumerate([(1.0, 0.5), (0.8, 0.1)]):
         rates = (0.0, 0.0)
@@ -220,11 +173,9 @@ def test_the_row_of_all_tasks_has_methods_that_ran_on_all_of_them(tmp_path):
         ("all tasks", "sacfd equi"),
     ]
     together = rows[-1]
-    assert together["success_iqm"] == pytest.approx(0.65)  # of 0.5 and 0.8
-    assert together["success_mean"] == pytest.approx(0.6)
-    # half of the larger rate of one task and the smaller one of the other
-    assert (together["low"], together["high"]) == (pytest.approx(0.45), pytest.approx(0.75))
-    assert together["seeds"] == 2
+    assert together["success"] == pytest.approx(0.6)
+    assert together["low"] < 0.6 < together["high"]
+    assert (together["seeds"], together["episodes"]) == (2, 10)
     assert list(together) == list(rows[0])
 
 
@@ -292,6 +243,35 @@ def test_runs_with_other_settings_are_not_averaged(tmp_path):
     }
 
 
+OTHERS = {"task_version": 1, "expert_version": None, "protocol": 0, "precision": "bfloat16"}
+OTHERS["policy_file"] = "0f"
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_runs_of_other_versions_are_rows_of_their_own_that_the_report_names(tmp_path, name):
+    write_run(tmp_path / "runs/a", (0, 0, 0.5))
+    write_run(tmp_path / "runs/b", (0, 0, 0.5), seed=1)
+    write_run(tmp_path / "runs/c", (0, 0, 0.5), task=PICK)
+    write_run(tmp_path / "runs/d", (0, 0, 1), seed=2, **{name: OTHERS[name]})
+    (section,), _ = load_sections([tmp_path / "runs"])
+    of_task = [group for group in section.groups if group.task == REACH]
+    assert sorted(len(group.runs) for group in of_task) == [1, 2]
+    write_report([tmp_path / "runs"], tmp_path / "report")
+    text = (tmp_path / "report/table.md").read_text()
+    (warning,) = re.findall(r"Not pooled, as they differ in .*", text)
+    for group in of_task:
+        folders = ", ".join(str(run.folder) for run in group.runs)
+        assert f"{REACH}, {group.method}: {folders}" in warning
+    assert "runs/c" not in warning
+    (row,) = (row for row in compare(section) if row["task"] == REACH)
+    assert row["reading"].startswith("not compared: ")
+    if name in ("task_version", "protocol"):
+        assert f"other {name.replace('_', ' ')}" in row["reading"]
+    # no method of all tasks has runs of two protocols
+    methods = {row["method"] for row in summarize(section) if row["task"] == "all tasks"}
+    assert len(methods) == (name in ("protocol", "precision", "policy_file"))
+
+
 def test_benchmarks_have_sections_and_other_runs_are_last(tmp_path):
     for name in (None, "close_loop_4d", "close_loop_3d"):
         write_run(tmp_path / str(name), (0, 0, 1), benchmark=name)
@@ -302,7 +282,10 @@ def test_benchmarks_have_sections_and_other_runs_are_last(tmp_path):
 def test_two_runs_of_one_seed_are_refused(tmp_path):
     for name, rate in (("a", 0), ("b", 1)):
         write_run(tmp_path / name, (0, 0, rate))
-    with pytest.raises(ConfigError, match=r"settings and seed: .*/a, .*/b; name the folders"):
+    for name, rate in (("c", 0), ("d", 1)):
+        write_run(tmp_path / name, (0, 0, rate), task=PICK)
+    every = r"settings and seed: .*/a, .*/b; .*/c, .*/d; name the folders"
+    with pytest.raises(ConfigError, match=every):
         load_sections([tmp_path])
 
 
@@ -331,7 +314,7 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
     file.write_text(file.read_text(), encoding="utf-8-sig")  # by an editor
     assert read_result(folder) == result
     assert [point.success_rate for point in result.curve] == [0.25, 0.5, 1.0]
-    assert result.final.mean_length == 9.0
+    assert result.last.mean_length == 9.0
     assert [path.name for path in folder.iterdir()] == ["result.json"]
 
 
@@ -408,7 +391,6 @@ def test_runs_are_compared_with_the_benchmark_of_the_package(tmp_path):
         assert report.changes(run.model_copy(update={"benchmark": "mine"})) == {}
 
 
-@pytest.mark.usefixtures("rliable")
 def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
     runs = tmp_path / "runs"
     for task in (REACH, PICK):
@@ -452,18 +434,24 @@ def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
     assert "sacfd &lt;cnn&gt;" in page.text
     assert "it broke" in page.text
     assert "stopped: interrupted" in page.text
-    rows = {(row[0], row[1]): row for row in page.rows[1:]}
+    rows = {(row[0], row[1]): row for row in page.rows[1:] if len(row) == len(page.rows[0])}
     assert len(rows) == 6
-    assert rows[REACH, "sacfd equi"][2:5] == ["2", "0.900", "0.699 to 0.972"]
-    assert rows[REACH, "sacfd equi"][7] == "300"
-    assert rows["all tasks", "sacfd equi"][3] == "0.900"
+    assert rows[REACH, "sacfd equi"][2:6] == ["2", "10", "0.900", "0.596 to 1.000"]
+    assert rows[REACH, "sacfd equi"][8] == "300"
+    assert rows["all tasks", "sacfd equi"][4] == "0.900"
 
     def table(name):
         with (folder / name).open() as file:
             return list(csv.DictReader(file))
 
     assert len(table("table.csv")) == 6
-    assert {float(row["success_iqm"]) for row in table("table.csv")} == {0.9, 0.4}
+    assert {float(row["success"]) for row in table("table.csv")} == {0.9, 0.4}
+    comparisons = {row["task"]: row for row in table("comparisons.csv")}
+    assert {*comparisons} == {REACH, PICK, "all tasks"}
+    for row in comparisons.values():
+        assert (row["first"], row["second"]) == ("sacfd <cnn>", "sacfd equi")
+        assert (float(row["difference"]), float(row["improvement"])) == (pytest.approx(-0.5), 0)
+        assert (row["seeds"], row["reading"]) == ("2", "direction only")
     assert [(row["seed"], row["success_rate"]) for row in table("seeds.csv")[:2]] == [
         ("0", "0.4"),
         ("1", "0.4"),
@@ -474,12 +462,12 @@ def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
         ("sacfd <cnn>", "200", "1001"),
     ]
     text = (folder / "table.md").read_text()
-    assert f"| {PICK} | sacfd equi | 2 | 0.900 | 0.699 to 0.972 |" in text
+    assert f"| {PICK} | sacfd equi | 2 | 10 | 0.900 | 0.596 to 1.000 |" in text
     assert "Some CPU, 2 cores, 2 threads; ba_torchrl 0.1.0, commit abc, torch 2.13.0" in text
     assert "it broke" in text
     latex = (folder / "table.tex").read_text()
     name = PICK.replace("_", r"\_")
-    assert rf"{name} & sacfd equi & 2 & 0.900 & 0.699 to 0.972 &" in latex
+    assert rf"{name} & sacfd equi & 2 & 10 & 0.900 & 0.596 to 1.000 &" in latex
 
     # methods in alphabetical order: "sacfd <cnn>" first
     both = folder / "close_loop_4d.svg"
@@ -490,17 +478,14 @@ def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
     assert (folder / "close_loop_4d.pdf").read_bytes().startswith(b"%PDF")
 
 
-@pytest.mark.parametrize(
-    ("seeds", "part"), [(1, "The interval of a single run"), (2, "Fewer than 5 seeds"), (5, None)]
-)
-def test_few_seeds_are_a_warning(tmp_path, seeds, part):
+@pytest.mark.parametrize("seeds", [1, 4, 5])
+def test_few_seeds_are_a_warning(tmp_path, seeds):
     for seed in range(seeds):
         write_run(tmp_path / f"runs/{seed}", (0.2, 0.7, 0.9), seed=seed)
     path = write_report([tmp_path / "runs"], tmp_path / "report")
     for name in ("report.html", "table.md", "table.tex"):
         text = (path.parent / name).read_text()
-        assert ("Fewer than 5 seeds" in text) is (seeds < 5)
-        assert part is None or part in text
+        assert ("Fewer than 5 seeds: direction only" in text) is (seeds < 5)
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")
@@ -513,8 +498,8 @@ def test_the_table_sorts_and_filters(tmp_path):
     script = """
         const found = [], field = document.querySelector("input");
         const shown = () => found.push([...document.querySelectorAll("tbody tr:not([hidden])")].map(
-            (row) => `${row.cells[3].textContent} ${row.cells[1].textContent}`));
-        for (const column of [3, 3, 1, 7, 7]) {
+            (row) => `${row.cells[4].textContent} ${row.cells[1].textContent}`));
+        for (const column of [4, 4, 1, 8, 8]) {
             document.querySelectorAll("th button")[column].click();
             shown();
         }
@@ -548,8 +533,8 @@ def test_panels_share_colours_and_keep_their_names(tmp_path):
     x = np.arange(500, 5000, 500)
     rising = 1 - np.exp(-x / 900)
     curves = {
-        "a": {"first": (x, rising), "second": (x, 0.5 * rising)},
-        "b": {"second": (x, rising)},
+        "a": {"first": Learning((x, rising)), "second": Learning((x, 0.5 * rising))},
+        "b": {"second": Learning((x, rising))},
     }
     path = tmp_path / "p.svg"
     plot_panels(curves, [path, tmp_path / "p.pdf"], names=["first", "second"])
@@ -570,23 +555,24 @@ def test_panels_share_colours_and_keep_their_names(tmp_path):
     with pytest.raises(ValueError, match="no panel"):
         plot_panels({}, [path], names=[])
     with pytest.raises(ValueError, match="third"):
-        plot_panels({"a": {"third": (x, x)}}, [path], names=["first"])
+        plot_panels({"a": {"third": Learning((x, x))}}, [path], names=["first"])
 
 
 def test_the_recipe_reports_several_folders(tmp_path):
     for name in ("one", "two"):
         write_run(tmp_path / name / "run", (0.2, 0.7, 0.9), benchmark=name)
     command = [sys.executable, "recipes/report.py", f"{tmp_path}/one", f"{tmp_path}/two"]
-    command.append("axis=env_steps")
+    command.append("axis=updates")
     done = subprocess.run(
         [*command, f"folder={tmp_path}/out"], cwd=ROOT, capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr[-2000:]
     assert "## one" in done.stdout
     assert f"{tmp_path}/out/report.html" in done.stdout
-    assert "environment steps" in texts(tmp_path / "out/one.svg")
+    assert "updates" in texts(tmp_path / "out/one.svg")
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    tables = {"table.csv", "table.md", "table.tex", "seeds.csv", "curves.csv"}
+    tables = {"table.csv", "table.md", "table.tex"}
+    tables |= {"comparisons.csv", "seeds.csv", "curves.csv"}
     figures = {"one", "one.svg", "one.pdf", "two", "two.svg", "two.pdf"}
     assert names == {"report.html", *tables, *figures}
 
@@ -596,7 +582,7 @@ def test_labels_are_apart_and_within_the_picture(tmp_path, count):
     names = [f"an algorithm on its network {i}" for i in range(count)]
     x = np.arange(5)
     path = tmp_path / "p.png"
-    plot_panels({"task": dict.fromkeys(names, (x, x / 8))}, [path], names=names)
+    plot_panels({"task": dict.fromkeys(names, Learning((x, x / 8)))}, [path], names=names)
     picture = imageio.imread(path)[..., :3] / 255
     for edge in (picture[:, :2], picture[:, -2:], picture[:2], picture[-2:]):
         assert (edge > 0.99).all()

@@ -3,6 +3,7 @@ import json
 import os
 import shutil
 import signal
+from typing import get_args
 
 import pytest
 import torch
@@ -16,15 +17,17 @@ from ba_torchrl.data.demos import collect_demonstrations
 from ba_torchrl.data.exchange import export_demonstrations
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
+from ba_torchrl.record.results import Phase, TestedPolicy, read_result
+from ba_torchrl.training import protocol
 from ba_torchrl.training.checkpoint import (
     Checkpoints,
     build_algorithm,
     find_checkpoint,
     load,
-    read_config,
 )
 from ba_torchrl.training.collection import gather_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.duration import precision
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
 from tests.recipes import recipe
@@ -62,7 +65,7 @@ def tiny(tmp_path, **changes):
 def test_a_run_writes_its_files(tmp_path):
     result = Experiment(tiny(tmp_path), progress=False).run()
     folder = tmp_path / "run"
-    assert result.evaluation.episodes == 4
+    assert result.last.episodes == 4
     assert result.curve.read_bytes().startswith(b"\x89PNG")
     assert result.video.stat().st_size > 1000
     assert json.loads((folder / "config.json").read_text())["task"] == TINY["task"]
@@ -150,25 +153,66 @@ def test_the_best_checkpoint_is_kept(tmp_path):
     assert kept == ["1", "3"]
 
 
-def test_the_best_policy_is_reported_on_request(tmp_path, monkeypatch):
-    experiment = Experiment(tiny(tmp_path, report="best", video_episodes=0), progress=False)
-    rates = iter([1.0, 0.9, 0.4, 0.7])  # the first is of the untrained policy
-    seeds = []
+def test_the_last_policy_and_the_best_checkpoint_are_tested(tmp_path, monkeypatch):
+    experiment = Experiment(tiny(tmp_path, video_episodes=0), progress=False)
+    rates = iter([1.0, 0.9, 0.4])  # the first is of the untrained policy
+    weights = []
 
-    def fake(env, policy, episodes, seed, on_episode):
-        seeds.append(seed)
+    def note():
         weights.append(next(experiment.algorithm.loss.parameters()).detach().clone())
+
+    def evaluate(env, policy, episodes, seed, on_episode):
+        note()
         return Evaluation(episodes, next(rates), 0.0, 1.0)
 
-    weights = []
-    monkeypatch.setattr("ba_torchrl.training.experiment.evaluate", fake)
+    def run_test(env, policy, updates, episodes, on_episode):
+        note()
+        seeds = list(range(episodes))
+        return TestedPolicy(
+            updates=updates, seeds=seeds, successes=[1] * episodes, lengths=[updates] * episodes
+        )
+
+    monkeypatch.setattr("ba_torchrl.training.experiment.evaluate", evaluate)
+    monkeypatch.setattr("ba_torchrl.training.experiment.run_test", run_test)
     result = experiment.run()
-    assert result.updates == 3
-    assert result.evaluation.success_rate == 0.7
-    assert result.checkpoint.name.endswith("3")
-    assert torch.equal(weights[3], weights[1])
+    assert (result.last.updates, result.best.updates) == (6, 3)
+    assert result.checkpoint.name.endswith("6")
+    assert torch.equal(weights[3], weights[2])
+    assert torch.equal(weights[4], weights[1])
     assert not torch.equal(weights[2], weights[1])
-    assert seeds[0] == seeds[1] == seeds[2] != seeds[3]
+    assert torch.equal(next(experiment.algorithm.loss.parameters()), weights[2])
+    record = read_result(tmp_path / "run")
+    assert (record.last, record.best) == (result.last, result.best)
+    assert record.files["best"].endswith("3")
+
+
+@pytest.mark.parametrize(
+    ("changes", "labels", "expert"),
+    [
+        ({}, 0, 0),
+        ({"algorithm": {"name": "dagger", "batch_size": 8}}, 8, 0),
+        ({"demonstrations": 0, "pretrain_updates": 0}, 0, None),
+    ],
+)
+def test_a_result_counts_what_the_run_used(tmp_path, changes, labels, expert):
+    config = tiny(tmp_path, video_episodes=0, **changes)
+    experiment = Experiment(config, progress=False)
+    experiment.run()
+    record = read_result(config.folder)
+    assert (record.protocol, record.task_version, record.expert_version) == (1, 0, expert)
+    assert record.demonstrations == config.demonstrations
+    assert (record.demonstration_steps >= 3) == bool(config.demonstrations)
+    assert record.expert_labels == labels
+    assert record.env_steps == record.curve[-1].env_steps
+    assert record.precision == precision(config)
+    policy = experiment.algorithm.policy
+    assert record.parameters == sum(value.numel() for value in policy.parameters()) > 0
+    assert record.last.seeds == [protocol.test_seed(episode) for episode in range(4)]
+    assert set(record.phase_seconds) == set(get_args(Phase))
+    assert record.seconds == pytest.approx(sum(record.phase_seconds.values()))
+    used = {name for name, seconds in record.phase_seconds.items() if seconds > 1e-3}
+    assert used >= {"updates", "evaluation", "collection", "other"}
+    assert ("demonstrations" in used) == bool(config.demonstrations)
 
 
 def test_a_folder_without_a_run_is_an_error(tmp_path):
@@ -307,7 +351,7 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
     config = tiny(tmp_path, **OPEN_LOOP, demonstrations_source=source)
     result = Experiment(config, progress=False).run()
     assert result.updates == 6
-    assert result.evaluation.episodes == 4
+    assert result.last.episodes == 4
     scalars = read_scalars(tmp_path / "run")
     assert scalars["demonstrations/success_rate"].values == [1.0]
     _, algorithm = load(tmp_path / "run")
@@ -426,7 +470,6 @@ def test_the_recipes_from_collection_to_evaluation(tmp_path, capsys):
     )
     assert [line[2] for line in out.splitlines() if "| first |" in line] == list("pxyzr")
     assert "over 3 episodes of close_loop/block_reaching" in out
-    config = read_config(tmp_path / "run")
-    assert f"seed {config.derived_seed(SeedUse.TEST)}, none of which training used" in out
+    assert "not citable: fewer than 200 episodes" in out
     assert f"update 3, {find_checkpoint(tmp_path / 'run')}" in out
     assert gif.read_bytes().startswith(b"GIF")

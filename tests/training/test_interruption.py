@@ -13,10 +13,11 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training import collection
 from ba_torchrl.training import experiment as experiments
+from ba_torchrl.training.checkpoint import Checkpoints
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
-from ba_torchrl.training.persistence import lock_holder
+from ba_torchrl.training.persistence import lock_holder, saved_steps
 from ba_torchrl.training.resume import resumable_updates
 
 SAC = {
@@ -63,14 +64,14 @@ def outcome(experiment):
     folder = experiment.config.folder
     state = experiment.algorithm.state_dict()
     result = read_result(folder).model_dump(
-        exclude={"seconds", "finished", "resumed_at", "files", "config", "curve", "final"}
+        exclude={"seconds", "phase_seconds", "finished", "resumed_at", "files", "config", "curve"}
     )
     curve = [point.model_dump(exclude={"seconds"}) for point in read_result(folder).curve]
     scalars = {
         name: (series.steps.tolist(), series.values.tolist())
         for name, series in read_scalars(folder).items()
     }
-    return state, {**result, "curve": curve, "final": read_result(folder).final}, scalars
+    return state, {**result, "curve": curve}, scalars
 
 
 def assert_same(one, two, path=""):
@@ -157,6 +158,22 @@ def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undi
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
+def test_a_run_that_was_killed_counts_each_label_once(tmp_path):
+    options = {"algorithm": {"name": "dagger", "batch_size": 4}, "eval_every": 50}
+    whole = run(config_for(tmp_path / "whole", **options))
+    assert whole[1]["expert_labels"] == whole[1]["env_steps"] > 0
+    assert (whole[1]["demonstrations"], whole[1]["demonstration_steps"] >= 2) == (2, True)
+    config = config_for(tmp_path / "run", **options, resume=True, save_minutes=1e-9)
+    experiment = Experiment(config, progress=False)
+    at_call(experiment, experiment.algorithm, "update", 11, kill)
+    with pytest.raises(Killed):
+        experiment.run()
+    assert_same(run(config), whole)
+    record = read_result(tmp_path / "run")
+    assert record.resumed_at == [10]
+    assert record.seconds == pytest.approx(sum(record.phase_seconds.values()))
+
+
 @pytest.mark.parametrize("evaluation", [1, pytest.param(2, marks=SLOW), 3])
 def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evaluation):
     experiment = Experiment(config_for(tmp_path), progress=False)
@@ -168,17 +185,24 @@ def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evalua
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
-def test_a_run_stopped_while_its_best_policy_is_evaluated_keeps_the_last_state(tmp_path):
-    whole = run(config_for(tmp_path / "whole", report="best"))
-    experiment = Experiment(config_for(tmp_path / "run", report="best"), progress=False)
-    at_call(experiment, experiment, "_evaluate", 5, terminate)  # after those at 0, 8, 16 and 21
+@pytest.mark.parametrize("number", [1, 2])
+def test_a_run_stopped_in_its_tests_keeps_the_last_state(tmp_path, number, monkeypatch):
+    def first_or_last(checkpoints, which):
+        newest, *_, oldest = saved_steps(checkpoints._folder / "checkpoints")
+        return {"latest": newest, "best": oldest}[which]
+
+    monkeypatch.setattr(Checkpoints, "find", first_or_last)
+    whole = run(config_for(tmp_path / "whole"))
+    assert whole[1]["best"]["updates"] < whole[1]["last"]["updates"] == 21
+    experiment = Experiment(config_for(tmp_path / "run"), progress=False)
+    at_call(experiment, experiment, "_test", number, terminate)
     saved = []
     save = experiment._state.save
     experiment._state.save = lambda updates: (saved.append(updates), save(updates))
     with pytest.raises(RunStopped, match="state saved"):
         experiment.run()
     assert saved == [0, 8, 16, 21]
-    assert_same(run(config_for(tmp_path / "run", report="best", resume=True)), whole)
+    assert_same(run(config_for(tmp_path / "run", resume=True)), whole)
 
 
 @pytest.mark.parametrize("number", [pytest.param(1, marks=SLOW), 5])
@@ -279,7 +303,8 @@ def test_a_failing_update_is_not_saved(tmp_path):
 def test_an_evaluation_draws_nothing_from_the_process_generators(tmp_path):
     experiment = Experiment(config_for(tmp_path), progress=False)
     before = GlobalRNGState().state_dict()
-    experiment._evaluate(2, SeedUse.EVALUATION)
+    experiment._evaluate()
+    experiment._test()
     assert_same(GlobalRNGState().state_dict(), before)
     experiment.close()
 

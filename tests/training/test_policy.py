@@ -3,8 +3,10 @@
 import json
 import re
 import shlex
+import shutil
 import sys
 from contextlib import closing
+from hashlib import sha256
 
 import pytest
 import torch
@@ -14,11 +16,13 @@ from torchrl.envs import StepCounter, TransformedEnv
 import ba_torchrl
 from ba_torchrl.commands import evaluate
 from ba_torchrl.errors import ConfigError
+from ba_torchrl.record.results import RunResult, TestedPolicy, read_result
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training import evaluation
+from ba_torchrl.training import evaluation, protocol
 from ba_torchrl.training import policy as policies
 from ba_torchrl.training.checkpoint import load
 from ba_torchrl.training.experiment import Experiment
+from docs import shipped as shipped_records
 from tests.recipes import recipe
 from tests.training.test_experiment import tiny
 
@@ -29,6 +33,13 @@ def run(tmp_path_factory):
     config = tiny(tmp_path_factory.mktemp("policy"), video_episodes=0)
     Experiment(config, progress=False).run()
     return config.folder
+
+
+def with_outcomes(*successes):
+    """A test with these outcomes."""
+    seeds = list(map(protocol.test_seed, range(len(successes))))
+    lengths = [7] * len(successes)
+    return TestedPolicy(updates=6, seeds=seeds, successes=successes, lengths=lengths)
 
 
 def observed(policy):
@@ -163,7 +174,7 @@ def test_a_file_acts_like_the_run(run, tmp_path):
     for weight, before in zip(policy.policy.state_dict().values(), trained, strict=True):
         torch.testing.assert_close(weight, before, rtol=2**-11, atol=2**-25)
     path = tmp_path / "p.safetensors"
-    card = policies.save_policy(policy, path, successes=3, episodes=4, seed=9, num_envs=2)
+    card = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
     text = path.with_suffix(".json").read_text()
     path.with_suffix(".json").write_text(text, encoding="utf-8-sig")  # by an editor
     again = ba_torchrl.load_policy(path)
@@ -172,15 +183,15 @@ def test_a_file_acts_like_the_run(run, tmp_path):
         again(state.clone())["action"], policy(state.clone())["action"], rtol=0, atol=0
     )
     assert again.card == card
-    assert (card.success_rate, card.episodes, card.seed) == (0.75, 4, 9)
-    command = "ba-torchrl evaluate policy=p.safetensors episodes=4 num_envs=2"
-    assert card.evaluate == f"{command} seed=9"
-    own = {"successes": 3, "episodes": 4, "num_envs": 2, "seed": policy.test_seed}
-    assert policies.save_policy(policy, tmp_path / "p.safetensors", **own).evaluate == command
+    assert (card.success_rate, card.episodes, card.protocol) == (0.75, 4, 1)
+    command = "ba-torchrl evaluate policy=p.safetensors episodes=4"
+    assert card.evaluate == command
     policy.config = policy.config.model_copy(update={"plugins": ["mine", "yours.nets"]})
-    with_plugins = policies.save_policy(policy, tmp_path / "p.safetensors", **own)
+    with_plugins = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
     assert with_plugins.evaluate == f"{command} 'plugins=[mine,yours.nets]'"
-    assert card.env_steps >= 0
+    result = read_result(run)
+    for name in ("env_steps", "demonstrations", "expert_labels", "expert_version"):
+        assert getattr(card, name) == getattr(result, name), name
     assert again.env_config == policy.env_config
     assert str(run) not in path.with_suffix(".json").read_text()
 
@@ -206,8 +217,7 @@ def test_what_is_no_policy_is_named(run, tmp_path):
     path.touch()
     with pytest.raises(ConfigError, match=r"cannot read .*p.json"):
         ba_torchrl.load_policy(path)
-    counts = {"successes": 1, "episodes": 1, "seed": 0, "num_envs": 1}
-    policies.save_policy(ba_torchrl.load_policy(run), path, **counts)
+    policies.save_policy(ba_torchrl.load_policy(run), path, with_outcomes(1))
     card = path.with_suffix(".json")
     saved = json.loads(card.read_text())
 
@@ -262,7 +272,7 @@ def test_a_shipped_policy_reaches_the_goal(task):
     assert policy.card.episodes >= 100
     env = ba_torchrl.make_vector_env(task, 5, parallel=False, **policy.env_config)
     try:
-        found = evaluation.evaluate(env, policy, 20, seed=policy.test_seed)
+        found = protocol.run_test(env, policy, policy.updates, 20)
     finally:
         env.close()
     assert found.success_rate >= policy.card.interval[0] - 0.2
@@ -288,32 +298,68 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF")
 
 
-def test_results_of_the_shipped_policies_are_kept(tmp_path, capsys, monkeypatch):
-    played = []
+def test_records_of_the_shipped_policies_are_kept_and_give_the_cards_their_numbers(
+    tmp_path, capsys, monkeypatch
+):
+    task, played = "close_loop/block_picking", []
 
     def play(policy, settings):
         played.append(settings.episodes)
-        return evaluation.Evaluation(settings.episodes, 0.5, 0.1, 7.0)
+        return with_outcomes(*[0, 1] * (settings.episodes // 2))
 
     monkeypatch.setattr(evaluate, "play", play)
-    shipped = "ba_torchrl.training.policy.shipped_policies"
-    monkeypatch.setattr(shipped, lambda: ["close_loop/block_picking"])
+    monkeypatch.setattr(policies, "shipped_policies", lambda: [task])
     words = ("trained", f"folder={tmp_path}", "episodes=20")
     recipe("evaluate", *words)
     first = capsys.readouterr().out
     recipe("evaluate", *words)
     assert capsys.readouterr().out == first
     assert "success_rate 0.50 (95 % interval 0.30 to 0.70) over 20 episodes" in first
+    assert "not citable: fewer than 200 episodes" in first
     (file,) = tmp_path.glob("close_loop_block_picking.json")
-    assert json.loads(file.read_text())["interval"] == pytest.approx((0.299, 0.701), abs=1e-3)
-    file.write_text(file.read_text()[:-9])
-    recipe("evaluate", *words)
-    recipe("evaluate", *words, "seed=3")
-    recipe("evaluate", "trained", "task=close_loop/block_picking", *words[1:], "num_envs=2")
-    with monkeypatch.context() as patch:
-        patch.setattr(TASKS["close_loop/block_picking"], "version", 1)
-        recipe("evaluate", *words, "num_envs=2")
-    assert played == [20, 20, 20, 20, 20]
-    with pytest.raises(SystemExit):
-        recipe("evaluate", "nothere", *words[1:])
-    assert "folder: it is for policy=trained" in capsys.readouterr().err
+    record = RunResult.model_validate_json(file.read_bytes())
+    assert (record.last.successes, record.best) == ([0, 1] * 10, record.last)
+    with pytest.raises(ValueError, match="20 episodes; evaluate with episodes=500"):
+        shipped_records.take(file)
+    for changed in (
+        file.read_text()[:-9],
+        record.model_copy(update={"task_version": 1}).model_dump_json(),
+        record.model_copy(update={"policy_file": "0"}).model_dump_json(),
+    ):
+        file.write_text(changed)
+        recipe("evaluate", *words)
+    recipe("evaluate", "trained", f"task={task}", *words[1:], "num_envs=2")
+    assert played == [20] * 4
+    recipe("evaluate", *words[:2], "episodes=200")
+    for name in (policies.TENSORS, policies.CARD):
+        shutil.copy(policies.shipped_file(task).with_suffix(name), tmp_path / f"p{name}")
+    monkeypatch.setattr(shipped_records, "shipped_file", lambda _: tmp_path / "p.safetensors")
+    monkeypatch.setattr(shipped_records, "RECORDS", tmp_path / "results")
+    assert shipped_records.take(file) == f"{task}: 0.500 over 200 episodes"
+    card = policies.read_card(tmp_path / "p.safetensors")
+    assert (card.success_rate, card.episodes, card.protocol) == (0.5, 200, 1)
+    assert card.evaluate == f"ba-torchrl evaluate policy=trained task={task} episodes=200"
+    (tmp_path / "p.safetensors").write_bytes(b"other")
+    with pytest.raises(ValueError, match=f"another policy of {task} is shipped"):
+        shipped_records.take(file)
+    for refused, message in (
+        (("nothere", *words[1:]), "folder: it is for policy=trained"),
+        ((*words, "seed=3"), "under the protocol; leave out seed"),
+    ):
+        with pytest.raises(SystemExit):
+            recipe("evaluate", *refused)
+        assert message in capsys.readouterr().err
+
+
+def test_a_shipped_policy_has_one_number_in_card_and_record():
+    files = {task: shipped_records.record_file(task) for task in policies.shipped_policies()}
+    for task, file in files.items():
+        if not file.exists():
+            continue
+        record = RunResult.model_validate_json(file.read_bytes())
+        path = policies.shipped_file(task)
+        card = policies.read_card(path)
+        assert record.policy_file == sha256(path.read_bytes()).hexdigest(), task
+        assert policies.tested_card(card, record) == card, task
+        assert record.last.seeds == list(map(protocol.test_seed, range(record.last.episodes)))
+        assert record.last.is_citable

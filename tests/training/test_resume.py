@@ -344,12 +344,12 @@ def test_the_result_holds_the_whole_run(tmp_path):
     assert values["config"]["env"]["robot"] == "kuka"
     assert values["config"]["algorithm"]["gamma"] == 0.99
     assert values["config"]["network"] == {"name": "cnn", **config.network_config.model_dump()}
-    assert values["final"]["success_rate"] == result.evaluation.success_rate
-    assert (values["final"]["policy"], values["final"]["updates"]) == ("last", 9)
+    assert values["last"] == result.last.model_dump()
+    assert values["last"]["updates"] == 9
     assert values["curve"][0]["episodes"] == 2
     assert values["versions"]["torch"] == torch.__version__
     assert values["hardware"]["cores"] >= 1
     assert values["hardware"]["cpu"]
-    assert set(values["files"]) == {"curve", "checkpoint", "video"}
+    assert set(values["files"]) == {"curve", "checkpoint", "best", "video"}
     assert all((config.folder / file).exists() for file in values["files"].values())
     assert values["seconds"] == pytest.approx(result.seconds)

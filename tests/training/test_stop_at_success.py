@@ -45,18 +45,16 @@ def test_a_run_ends_after_two_successful_evaluations_in_a_row(tmp_path, seeds, c
     assert "the run ends at update 8" in caplog.text
     record = read_result(config.folder)
     assert [point.updates for point in record.curve] == [0, 2, 4, 6, 8]
-    assert record.final.updates == 8
+    assert record.last.updates == 8
     assert record.curve[0].success_rate == UNTRAINED
     assert seeds[0] == seeds[1]
-    assert len(set(seeds[1:])) == len(seeds[1:]) == 5
+    assert len(set(seeds[1:])) == len(seeds[1:]) == 4
 
 
 def test_without_a_rate_all_updates_are_taken_and_the_episodes_are_the_same(tmp_path, seeds):
     config = config_for(tmp_path, stop_at_success=None)
     assert Experiment(config, progress=False).run().updates == 12
-    assert seeds == [config.derived_seed(SeedUse.EVALUATION)] * 7 + [
-        config.derived_seed(SeedUse.REPORT)
-    ]
+    assert seeds == [config.derived_seed(SeedUse.EVALUATION)] * 7
 
 
 def test_a_run_ends_while_it_learns_from_demonstrations_alone(tmp_path, seeds):

@@ -234,7 +234,7 @@ def status(run: ExperimentConfig) -> Status:
             )
         if (folder / CONFIG_FILE).exists():
             check_same_versions(run)
-        return Status("done", f"success {result.final.success_rate:.2f}")
+        return Status("done", f"success {result.last.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         try:
             read_config(folder, device=run.device)

@@ -140,7 +140,6 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
             "algorithm__weight_decay": 1e-4,
             "algorithm__gradient_clamp": 0.1,
             "updates_per_step": 2,
-            "report": "best",
         },
     ),
     "quickstart": (CLOSE_LOOP_TASK, "sacfd_per_so2", "equi_small", {"file": "quickstart"}),

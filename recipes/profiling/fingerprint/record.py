@@ -354,7 +354,7 @@ def run_training(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> N
     traces["scalars"] = {"facts": {"updates": " ".join(steps)}, "steps": list(steps.values())}
     facts["updates"] = result.updates
     for name in ("episodes", "success_rate", "mean_length"):
-        facts[f"evaluation {name}"] = getattr(result.evaluation, name)
+        facts[f"evaluation {name}"] = getattr(result.last, name)
     algorithm = experiment.algorithm
     augmentation = algorithm.replay.transform.state_dict()
     for name, state in {**algorithm.state_dict(), "augmentation": augmentation}.items():

@@ -53,24 +53,29 @@ results = json.loads((folder.parents[2] / "results.json").read_text())
 
 
 def result_of(run):
+    test = {"updates": 6, "seeds": [1, 2], "successes": [0, 1], "lengths": [4, 2]}
     return RunResult(
+        protocol=1,
         task=run.task,
+        task_version=0,
+        expert_version=0,
         label=run.label,
         benchmark=run.benchmark,
         seed=run.seed,
         curve=[],
-        final={
-            "policy": "last",
-            "updates": 6,
-            "episodes": 2,
-            "success_rate": 0.5,
-            "standard_error": 0.35,
-            "mean_length": 3.0,
-        },
+        last=test,
+        best=test,
+        demonstrations=3,
+        demonstration_steps=9,
+        env_steps=8,
+        expert_labels=0,
+        precision="float32",
+        parameters=10,
         config=run.resolved(),
         versions={},
         hardware={},
         seconds=1.0,
+        phase_seconds={},
         finished="2000-01-01T00:00:00+00:00",
         files={},
     )

@@ -1,0 +1,67 @@
+"""The protocol of tests: which episodes a policy is tested in. Its page is docs/protocol.md.
+
+The seeds of a test are the same for all runs, policies and methods. They are above `MAX_SEED`, the
+largest seed that a run, a command or a derived seed can have, so that no training, demonstration or
+selection of a checkpoint has seen them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from tensordict import TensorDict
+from torch import nn
+from torchrl.envs import EnvBase
+from torchrl.envs.utils import ExplorationType, set_exploration_type
+
+from ba_torchrl.algorithms.acting import constant_weights
+from ba_torchrl.config import FIRST_TEST_SEED
+from ba_torchrl.data.episodes import Policy, is_success, play_seeds
+from ba_torchrl.record.results import TestedPolicy
+
+PROTOCOL = 1
+"""Rises when the numbers of the same policies change."""
+TEST_EPISODES = 500
+"""Episodes of a number that is cited."""
+
+
+def test_seed(episode: int) -> int:
+    """Return the seed of an episode of a test, from 0; the episode is ``env.reset(seed=...)``."""
+    return FIRST_TEST_SEED + episode
+
+
+def run_test(
+    env: EnvBase,
+    policy: Policy,
+    updates: int,
+    episodes: int = TEST_EPISODES,
+    on_episode: Callable[[TensorDict], None] | None = None,
+    first_seed: int = FIRST_TEST_SEED,
+) -> TestedPolicy:
+    """Play the first episodes of a test greedily; the weights stay constant.
+
+    The result does not depend on the environments' number and processes, except that a network may
+    compute other last bits for another batch size.
+
+    Args:
+        env: a vector of environments.
+        policy: acts greedily under TorchRL's deterministic exploration type.
+        updates: gradient updates of the policy.
+        episodes: their number.
+        on_episode: called with each episode when it ends, for progress bars.
+        first_seed: of the episodes; with another than the protocol's, it is no test.
+    """
+    seeds = [first_seed + episode for episode in range(episodes)]
+    with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
+        played = play_seeds(env, policy, seeds, on_episode)
+    return TestedPolicy(
+        updates=updates,
+        seeds=seeds,
+        successes=[int(is_success(episode)) for episode in played],
+        lengths=[len(episode) for episode in played],
+    )
+
+
+def count_parameters(policy: nn.Module) -> int:
+    """Return the number of parameters of an acting policy."""
+    return sum(parameter.numel() for parameter in policy.parameters())

@@ -1,0 +1,134 @@
+"""The leaderboard and the results page: what is in the table, and what is left out."""
+
+import re
+
+import pytest
+
+from ba_torchrl import list_tasks
+from ba_torchrl.commands import leaderboard as command
+from ba_torchrl.errors import ConfigError
+from ba_torchrl.record import leaderboard as boards
+from ba_torchrl.record.leaderboard import leaderboard
+from ba_torchrl.record.results import read_result
+from ba_torchrl.record.summary import Run
+from ba_torchrl.tasks.base import TASKS
+from docs import results as page
+from tests.record.test_report import PICK, REACH, policy_test, write_run
+
+NO_RECORDS = "<!-- results: begin -->\nold\n<!-- results: end -->\nend"
+
+
+def make_run(folder, rate=0.9, **changes):
+    """Return a run of block reaching with 200 test episodes, of the present versions."""
+    robot = {"env": {"robot": "kuka"}}
+    values = {"expert_version": TASKS[REACH].expert_version, "config": robot, **changes}
+    values = {
+        "task_version": TASKS[REACH].version,
+        "last": policy_test(rate, episodes=200),
+    } | values
+    write_run(folder, (0.1, 0.5, rate), benchmark=None, **values)
+    return Run(folder, read_result(folder))
+
+
+@pytest.fixture
+def records(tmp_path, monkeypatch):
+    """Return an empty folder in the place of the package's records."""
+    folder = tmp_path / "records"
+    folder.mkdir()
+    monkeypatch.setattr(boards, "RECORDS", folder)
+    monkeypatch.setattr(page, "RECORDS", folder)
+    return folder
+
+
+def test_every_task_has_a_row_and_empty_cells_are_visible(tmp_path):
+    runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", task=PICK, label="bc cnn")]
+    header, *rows = leaderboard(runs, [], list_tasks(), protocol=1).rows()
+    assert header == ["task", "bc cnn", "sacfd equi"]
+    assert [row[0] for row in rows] == list_tasks()
+    cells = {task: (first, second) for task, first, second in rows}
+    assert cells[REACH] == ("–", "0.90 (0.85 to 0.93) 1×200*")
+    assert cells[PICK] == ("0.90 (0.85 to 0.93) 1×200*", "–")
+    assert {cell for task, pair in cells.items() if task not in (REACH, PICK) for cell in pair} == {
+        "–"
+    }
+
+
+def test_five_seeds_are_no_mere_direction(tmp_path):
+    runs = [make_run(tmp_path / str(seed), seed=seed) for seed in range(5)]
+    (_, (_, cell)) = leaderboard(runs, [], [REACH], protocol=1).rows()
+    assert re.fullmatch(r"0\.90 \(0\.8\d to 0\.9\d\) 5×200", cell)
+
+
+def test_all_runs_of_other_versions_are_left_out_and_named(tmp_path):
+    others = {
+        "protocol 0 instead of 1": {"protocol": 0},
+        "task version 9 instead of 0": {"task_version": 9},
+        "expert version 9 instead of 0": {"expert_version": 9},
+        "100 test episodes, fewer than 200": {"last": policy_test(0.9, episodes=100)},
+        "its task is not registered": {"task": "mine/push"},
+    }
+    runs = [make_run(tmp_path / str(n), **each) for n, each in enumerate(others.values())]
+    runs += [make_run(tmp_path / "none", expert_version=None)]
+    board = leaderboard([], runs, [REACH], protocol=1)
+    assert [len(group.runs) for group in board.cells.values()] == [1]
+    for text, run, why in zip(board.left_out, runs, others, strict=False):
+        assert text.endswith(f"seed 0 ({run.folder}): {why}")
+    assert len(board.left_out) == len(others)
+
+
+def test_own_runs_are_beside_those_of_the_package(tmp_path):
+    packaged, own = make_run(tmp_path / "a"), make_run(tmp_path / "b", 0.5)
+    board = leaderboard([packaged], [packaged, own], [REACH], protocol=1)
+    assert board.methods == ["sacfd equi", "sacfd equi, own"]
+    assert board.rows()[1][2].startswith("0.50")
+    assert leaderboard([packaged], [packaged], [REACH], protocol=1).methods == ["sacfd equi"]
+    with pytest.raises(ConfigError, match=r"same settings and seed: .*/a, .*/b"):
+        leaderboard([], [packaged, own], [REACH], protocol=1)
+
+
+@pytest.mark.usefixtures("records")
+def test_the_command_prints_the_table(tmp_path, capsys):
+    make_run(tmp_path / "runs/a", label="my method")
+    make_run(tmp_path / "runs/b", label="older", protocol=0)
+    (tmp_path / "runs/c").mkdir()
+    (tmp_path / "runs/c/config.json").write_text("{}")
+    command.COMMAND.run([str(tmp_path / "runs")])
+    text = capsys.readouterr().out
+    assert re.search(rf"^{REACH}  +0\.90 \(", text, flags=re.MULTILINE)
+    assert re.search(rf"^{PICK}  +–$", text, flags=re.MULTILINE)
+    assert "older, seed 0" in text
+    assert f"- {tmp_path / 'runs/c'}: interrupted" in text
+    command.COMMAND.run([str(tmp_path / "runs"), "format=markdown"])
+    assert f"| {PICK} | – |" in capsys.readouterr().out
+    command.COMMAND.run([])  # no records
+    assert all(
+        f"\n{task}\n" in capsys_text
+        for capsys_text in [capsys.readouterr().out]
+        for task in list_tasks()
+    )
+
+
+def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
+    tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
+    assert len(re.findall(r"^\| `", page.page_with_results(NO_RECORDS), flags=re.MULTILINE)) == len(
+        tasks
+    )
+    for seed in range(2):
+        make_run(tmp_path / f"runs/{seed}", seed=seed)
+    assert page.add([str(tmp_path / "runs")]) == 2
+    file = make_run(tmp_path / "file", policy_file="0f", task=PICK, curve=[], env_steps=None)
+    file = file.result.model_copy(update={"seconds": None})
+    (records / "trained.json").write_text(file.model_dump_json())
+    assert sorted(path.name for path in records.iterdir()) == [
+        "close_loop_block_reaching_sacfd_equi_seed0.json",
+        "close_loop_block_reaching_sacfd_equi_seed1.json",
+        "trained.json",
+    ]
+    text = page.page_with_results(NO_RECORDS)
+    assert "| sacfd equi (policy from a file) | sacfd equi (policy of a run) |" in text
+    assert "results/close_loop.svg" in text
+    assert "## Open loop" not in text
+    (row,) = re.findall(rf"^\| `{REACH}` \| <img.*", text, flags=re.MULTILINE)
+    assert "2×200* | 0.90 | 6.0 | 5 | 1500 | 33 | Some CPU | abc |" in row
+    (row,) = re.findall(rf"^\| `{PICK}` \| <img.*", text, flags=re.MULTILINE)
+    assert "1×200* | 0.90 | 6.0 | 5 | – | – | Some CPU | abc |" in row
