@@ -29,7 +29,7 @@ from tensordict import TensorDictBase
 
 import ba_torchrl
 from ba_torchrl.envs import keys
-from ba_torchrl.envs.base import ManipulationEnv
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, versions_of
 
@@ -88,7 +88,7 @@ def play(
 
 
 def _play_episode(
-    env: ManipulationEnv,
+    env: BulletArmEnv,
     number: int,
     actions: list[list[float]] | None,
     found: tuple[Rows, Rows],
@@ -127,7 +127,7 @@ def _play_episode(
         state = env.step(state.clone().set(keys.ACTION, action))[keys.NEXT]
 
 
-def _quantities(env: ManipulationEnv, state: TensorDictBase) -> dict[str, list[float]]:
+def _quantities(env: BulletArmEnv, state: TensorDictBase) -> dict[str, list[float]]:
     """Return the quantities of a state; of the objects, sums weighted by their numbers."""
     task, robot = env.scene.task, env.scene.robot
     positions, yaws_rad = zip(*task.landmarks, strict=True)
