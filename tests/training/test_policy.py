@@ -145,9 +145,9 @@ def test_a_policy_of_another_version_of_its_task_is_said_and_not_exported(
     run, tmp_path, monkeypatch, caplog
 ):
     policy, path = ba_torchrl.load_policy(run), tmp_path / "p.safetensors"
-    counts = {"successes": 1, "episodes": 1, "seed": 0, "num_envs": 1}
+    test = with_outcomes(1)
     monkeypatch.setattr(TASKS[policy.task], "expert_version", 3)
-    card = policies.save_policy(policy, path, **counts)
+    card = policies.save_policy(policy, path, test)
     assert (card.task_version, card.expert_version) == (0, 0)
     assert not caplog.records
     monkeypatch.setattr(TASKS[policy.task], "version", 1)
@@ -156,7 +156,7 @@ def test_a_policy_of_another_version_of_its_task_is_said_and_not_exported(
     start = f"the policy was trained in version 0 of {policy.task}, which has version 1 here"
     assert [message.startswith(start) for message in caplog.messages] == [True, True]
     with pytest.raises(ConfigError, match="its episodes are of version 1: train it again"):
-        policies.save_policy(policy, path, **counts)
+        policies.save_policy(policy, path, test)
 
 
 def test_any_batch_shape_is_taken(shipped):
