@@ -26,7 +26,13 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.duration import PhaseClock, UpdateTimer, compute_path, precision
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
-from ba_torchrl.training.outputs import Result, plot_curve, record_video, write_record
+from ba_torchrl.training.outputs import (
+    Result,
+    check_packages,
+    plot_curve,
+    record_video,
+    write_record,
+)
 from ba_torchrl.training.persistence import RunLock
 from ba_torchrl.training.protocol import run_test
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
@@ -44,7 +50,7 @@ class Experiment:
 
     Raises:
         ConfigError: the run folder holds another run, or this one with other settings, or another
-            process runs it.
+            process runs it; or a package for its curve or video is missing.
     """
 
     def __init__(self, config: ExperimentConfig, progress: bool = True) -> None:
@@ -52,6 +58,7 @@ class Experiment:
         self.progress = progress
         if config.threads is not None:
             torch.set_num_threads(config.threads)
+        check_packages(config)
         if config.tf32 is not None:
             torch.backends.cuda.matmul.allow_tf32 = config.tf32
             torch.backends.cudnn.allow_tf32 = config.tf32

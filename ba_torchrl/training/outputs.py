@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.data.episodes import Policy
+from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.hardware import hardware
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
@@ -44,6 +46,17 @@ class Result:
     def updates(self) -> int:
         """Updates of the last policy."""
         return self.last.updates
+
+
+def check_packages(config: ExperimentConfig) -> None:
+    """Check that the packages are installed that the run needs when it ends.
+
+    Raises:
+        MissingPackageError: one is not.
+    """
+    needed = ["matplotlib", *(("imageio", "imageio_ffmpeg") if config.video_episodes else ())]
+    if missing := [name.replace("_", "-") for name in needed if find_spec(name) is None]:
+        raise MissingPackageError(f"a run's curve and video need {install_command(*missing)}")
 
 
 def plot_curve(config: ExperimentConfig, curve: list[CurvePoint]) -> Path:

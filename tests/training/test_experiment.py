@@ -3,6 +3,7 @@ import json
 import os
 import shutil
 import signal
+import sys
 from typing import get_args
 
 import pytest
@@ -329,6 +330,14 @@ def test_a_logger_without_its_package_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr("ba_torchrl.training.config.is_available", lambda backend: False)
     with pytest.raises(ConfigError, match=r"pip install .*wandb"):
         tiny(tmp_path, logger="wandb")
+
+
+def test_a_run_whose_video_lacks_a_package_does_not_start(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ConfigError, match="pip install imageio-ffmpeg"):
+        Experiment(tiny(tmp_path, video_episodes=1))
+    assert not list(tmp_path.iterdir())
+    Experiment(tiny(tmp_path, video_episodes=0)).close()
 
 
 def test_an_image_size_that_the_network_does_not_take_is_refused(tmp_path):
