@@ -129,7 +129,7 @@ def _cells(group: Group) -> list[str]:
         _mean([result.demonstrations for result in results]),
         _mean([result.env_steps for result in results]),
         _mean([result.seconds and result.seconds / 60 for result in results]),
-        ", ".join(sorted({result.hardware["cpu"] for result in results})),
+        ", ".join(sorted({result.hardware["gpu"] or result.hardware["cpu"] for result in results})),
         ", ".join(sorted({result.versions.get("commit", "") for result in results})),
     ]
 
