@@ -52,6 +52,10 @@ class _MadeByTask(type(EnvBase)):
         if cls is BulletArmEnv:
             resolved = resolve_env(task, config)
             env = CONTROLS[resolved.task_class.control](resolved)
+        elif not isinstance(task, ResolvedEnv):
+            raise TypeError(
+                f"{cls.__name__} takes what resolve_env returned, not {task!r}: call BulletArmEnv"
+            )
         else:
             env = super().__call__(task, **config)
         return env if device is None else env.to(device)
@@ -281,7 +285,13 @@ class BulletArmEnv(ChecksPolicy, CopiesWithState, EnvBase, metaclass=_MadeByTask
                 "TorchRL drops it (TransformedEnv, ParallelEnv with buffers), use "
                 "reset(set_state=True, state=td)"
             )
-        state: EnvState = tensordict[keys.STATE]
+        state = tensordict[keys.STATE]
+        if not isinstance(state, EnvState):
+            raise ConfigError(
+                f"the entry {keys.STATE!r} is not that of get_state() of one environment, but "
+                f"{type(state).__name__}; for several, reset(set_state=True, "
+                'list_of_kwargs=[{"state": each} for each in states])'
+            )
         if state.origin != self._origin:
             raise ConfigError("the state is of an environment with another task or parameters")
         self._episodes.restore(state.scale, state.scene)
@@ -326,6 +336,8 @@ class BulletArmEnv(ChecksPolicy, CopiesWithState, EnvBase, metaclass=_MadeByTask
     ) -> TensorDict:
         if set_state:
             return self._set_state(tensordict if state is None else state)
+        if state is not None:
+            raise ConfigError("state= needs set_state=True beside it, also with list_of_kwargs")
         if seed is not None:
             self._set_seed(seed)
         self._episode += 1

@@ -48,6 +48,8 @@ def test_the_class_makes_an_environment_of_the_tasks_control(task):
 def test_an_environment_of_another_constructor_is_one_of_the_class():
     env = make_deconstruction_env("open_loop/block_stacking", obs_size=16, num_objects=2)
     assert isinstance(env, BulletArmEnv)
+    with pytest.raises(TypeError, match="call BulletArmEnv"):
+        type(env)("open_loop/block_stacking")
     env.close()
 
 

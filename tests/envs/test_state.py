@@ -14,6 +14,7 @@ from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
 
 import ba_torchrl
 from ba_torchrl.config import WorkerOptions
+from ba_torchrl.envs.vector.batching import Vector
 from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.testing.episodes import image_of
@@ -197,6 +198,10 @@ def test_a_reset_to_no_state_of_these_parameters_is_refused():
     with pytest.raises(ConfigError, match="another task or parameters"):
         other.reset(env.get_state(), set_state=True)
     kept = env.get_state()
+    with pytest.raises(ConfigError, match="list_of_kwargs"):
+        env.reset(set_state=True, state=torch.stack([kept, kept]))
+    with pytest.raises(ConfigError, match="needs set_state=True"):  # not a new episode
+        env.reset(state=kept)
     first = env.step(kept.clone().set("action", torch.full((5,), -0.5)))["next", "depth"]
     assert not torch.equal(env.reset(kept)["depth"], first)  # a new episode
     assert env._episode == 2
@@ -265,6 +270,11 @@ def test_a_state_is_a_keyword_where_torchrl_passes_no_entry(make_vector):
         assert torch.equal(second["depth"], torch.stack(first)["depth"])
         state = vector.reset(set_state=True, state=kept[0])
         assert torch.equal(state["depth"][0], state["depth"][1])
+        inner = vector.base_env if isinstance(vector, TransformedEnv) else vector
+        if isinstance(inner, Vector):  # the stack of a vector's get_state
+            state = vector.reset(set_state=True, state=torch.stack(kept))
+            second = vector.step(state.set("action", STEP))["next"]
+            assert torch.equal(second["depth"], torch.stack(first)["depth"])
     finally:
         vector.close()
         env.close()

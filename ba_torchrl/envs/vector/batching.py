@@ -186,6 +186,7 @@ class Vector(ChecksPolicy, EnvBase):
         set_state: bool = False,
         **kwargs: Any,
     ) -> TensorDictBase:
+        state = kwargs.pop("state", tensordict) if set_state else None
         each = kwargs.pop("list_of_kwargs", [{}] * self.num_workers)
         options = [{**kwargs, **own} for own in each]
         if seed is not None:
@@ -193,8 +194,8 @@ class Vector(ChecksPolicy, EnvBase):
             self._base_seed = int(seed)
             options = [{**own, "seed": self._base_seed + i} for i, own in enumerate(options)]
         if set_state:
-            given = TensorDict({}, self.batch_size) if tensordict is None else tensordict
-            rows = given.exclude(*self.reset_keys).unbind(0)
+            given = TensorDict() if state is None else state
+            rows = given.exclude(*self.reset_keys).expand(self.batch_size).unbind(0)
             options = [
                 {"tensordict": row, "set_state": True, **own}
                 for own, row in zip(options, rows, strict=True)
