@@ -154,7 +154,7 @@ class RigidAugmentation(SeededTransform):
         Args:
             tensordict: holds the images, the action and their successors.
         """
-        out = tensordict.copy()
+        out = self._copied(tensordict)
         if self.transforms == "none":
             return out
         others = {keys.ACTION, keys.TARGET_ACTION} - {self._action_key}

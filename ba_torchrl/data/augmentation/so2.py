@@ -146,6 +146,19 @@ class SeededTransform(Transform):
             "replay, not to an environment"
         )
 
+    def _copied(self, tensordict: TensorDictBase) -> TensorDictBase:
+        """Return a copy of transitions, whose entries can be replaced.
+
+        Raises:
+            ConfigError: they are not a batch [B].
+        """
+        if tensordict.ndim != 1:
+            raise ConfigError(
+                f"{type(self).__name__} takes a batch of transitions [B], not "
+                f"{list(tensordict.shape)}: flatten slices and episodes, reshape(-1), first"
+            )
+        return tensordict.copy()
+
     def get_extra_state(self) -> Tensor:
         """Return the generator's state, so that a checkpoint continues the same draws."""
         return self._generator.get_state()
@@ -200,11 +213,12 @@ class SO2Augmentation(SeededTransform):
             tensordict: holds the images, their successors, ``action`` and, if there is one,
                 ``target_action``.
         """
-        (batch,) = tensordict.batch_size
-        draws = torch.rand(2, batch, generator=self._generator, dtype=torch.float64, device="cpu")
+        out = self._copied(tensordict)
+        draws = torch.rand(
+            2, len(out), generator=self._generator, dtype=torch.float64, device="cpu"
+        )
         chosen = (draws[0] < self.probability).nonzero().squeeze(-1)
         angle = 2 * math.pi * draws[1, chosen]
-        out = tensordict.copy()
         if not len(chosen):
             return out
         for key in self._scene_images:

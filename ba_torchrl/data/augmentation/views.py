@@ -51,6 +51,9 @@ class CenterCrop(Transform):
         size: rows and columns, pixels.
         in_keys: images [..., H, W].
         out_keys: their parts [..., size, size]; None to replace the images.
+
+    Raises:
+        ConfigError: at the first image that is smaller than its part.
     """
 
     def __init__(
@@ -74,6 +77,10 @@ class CenterCrop(Transform):
         return self._call(tensordict_reset)
 
     def _apply_transform(self, images: Tensor) -> Tensor:
+        if min(images.shape[-2:]) < self.size:
+            raise ConfigError(
+                f"images of {list(images.shape[-2:])} px have no centre of {self.size} px"
+            )
         row, column = ((length - self.size) // 2 for length in images.shape[-2:])
         return images[..., row : row + self.size, column : column + self.size]
 
@@ -153,7 +160,7 @@ class RandomViews(SeededTransform):
         Args:
             tensordict: holds the images, the holding flag and their successors.
         """
-        out = tensordict.copy()
+        out = self._copied(tensordict)
         is_paired = self.views == self.target_views == 1
         for key in self.sizes:
             image, following = tensordict[key], tensordict[keys.NEXT, key]

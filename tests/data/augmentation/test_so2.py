@@ -16,6 +16,7 @@ from ba_torchrl.data.augmentation.so2 import (
 )
 from ba_torchrl.envs import keys
 from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.errors import ConfigError
 from tests.specs import from_replay
 
 IMAGES = {"depth": ImageSpec(1, 32, 0.4)}
@@ -179,6 +180,11 @@ def test_draws_come_from_the_modules_own_generator():
     assert (two(data) == one(data)).all()
     other = SO2Augmentation(IMAGES, "pxyzr", seed=6)(data)
     assert not torch.equal(other[keys.DEPTH], first[keys.DEPTH])
+
+
+def test_episodes_of_several_dimensions_are_refused_with_the_way_out():
+    with pytest.raises(ConfigError, match=r"SO2Augmentation takes .* \[B\], .*reshape\(-1\)"):
+        SO2Augmentation(IMAGES, "pxyzr", seed=0)(batch(n=4).reshape(2, 2))
 
 
 def test_invalid_arguments_are_refused():

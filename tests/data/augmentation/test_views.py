@@ -163,6 +163,11 @@ def test_the_centre_crop_is_in_the_middle(height, start):
     assert torch.equal(CenterCrop(size, ["depth"])(TensorDict(depth=images))["depth"], expected)
 
 
+def test_images_smaller_than_the_centre_are_refused():
+    with pytest.raises(ConfigError, match="no centre of 11 px"):
+        CenterCrop(11, [keys.DEPTH])(batch())
+
+
 def test_declarations_have_the_size_of_the_crop_and_small_images_are_refused():
     assert cropped_images(close_loop_images(142), 128)[keys.DEPTH].size == 128
     for size in (64, 128):  # all crops of 128 of 128 px would be the same
