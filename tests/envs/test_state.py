@@ -10,7 +10,7 @@ import gymnasium
 import pybullet
 import pytest
 import torch
-from torchrl.envs import ParallelEnv, SerialEnv, StepCounter, TransformedEnv
+from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
 
 import ba_torchrl
 from ba_torchrl.config import WorkerOptions
@@ -250,8 +250,9 @@ def test_a_vector_restores_the_states_of_its_environments(name):
         partial(ParallelEnv, 2, mp_start_method="fork"),
         lambda makers: TransformedEnv(SerialEnv(2, makers), StepCounter(step_count_key="count")),
         VECTORS["one process"],
+        lambda makers: TransformedEnv(VECTORS["processes"](makers), RewardSum()),
     ],
-    ids=["ParallelEnv", "TransformedEnv", "one process"],
+    ids=["ParallelEnv", "TransformedEnv", "one process", "TransformedEnv of processes"],
 )
 def test_a_state_is_a_keyword_where_torchrl_passes_no_entry(make_vector):
     make = partial(ba_torchrl.BulletArmEnv, "close_loop/block_picking", obs_size=16)
