@@ -24,7 +24,7 @@ from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, Phase, differences
-from ba_torchrl.tasks.base import versions_of
+from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.checkpoint import read_config, read_versions, write_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.persistence import (
@@ -182,17 +182,21 @@ def check_same_run(config: ExperimentConfig) -> None:
         raise ConfigError(
             f"the run in {config.folder} was started with other settings:\n  " + "\n  ".join(lines)
         )
-    check_same_versions(config)
+    check_same_versions(config, read_versions(config.folder))
 
 
-def check_same_versions(config: ExperimentConfig) -> None:
+def check_same_versions(config: ExperimentConfig, there: Versions) -> None:
     """Check that the run in the folder of ``config`` has the present versions of task and expert.
+
+    Args:
+        config: of the run.
+        there: its versions; an expert that is not known, or took no part, may be any.
 
     Raises:
         ConfigError: it has others.
     """
-    there, here = read_versions(config.folder), versions_of(config.task)
-    if there != here:
+    here = versions_of(config.task)
+    if there.task != here.task or there.expert not in (None, here.expert):
         raise ConfigError(
             f"the run in {config.folder} was started with {there} of {config.task}, here are "
             f"{here}: choose another folder, or use the package that started it"

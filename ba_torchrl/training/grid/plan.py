@@ -23,7 +23,7 @@ from ba_torchrl.record.results import (
     read_failure,
     read_result,
 )
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import TASKS, Versions
 from ba_torchrl.training.config import ExperimentConfig
 
 if TYPE_CHECKING:
@@ -232,8 +232,7 @@ def status(run: ExperimentConfig) -> Status:
                 f"{folder} holds a run with other settings; choose another folder:\n  "
                 + "\n  ".join(lines)
             )
-        if (folder / CONFIG_FILE).exists():
-            check_same_versions(run)
+        check_same_versions(run, Versions(result.task_version, result.expert_version))
         return Status("done", f"success {result.last.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         try:

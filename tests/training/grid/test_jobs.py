@@ -17,7 +17,6 @@ from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.launchers import local
@@ -140,14 +139,19 @@ def test_a_setting_that_is_newer_than_a_finished_run_has_its_default_there(tmp_p
         status(run)
 
 
-def test_a_finished_run_of_another_version_of_its_task_is_refused(tmp_path, fake, monkeypatch):
+@pytest.mark.parametrize("name", ["version", "expert_version"])
+def test_a_finished_run_of_another_version_is_refused(tmp_path, fake, monkeypatch, name):
     run = planned(tmp_path)[0]
     fake([run])
-    write_config(run)
     assert status(run).state == "done"
-    monkeypatch.setattr(TASKS[run.task], "version", 7)
-    with pytest.raises(ConfigError, match=r"here are task version 7, .*: choose another folder"):
+    monkeypatch.setattr(TASKS[run.task], name, 7)
+    with pytest.raises(ConfigError, match=r"here are .* version 7.*: choose another folder"):
         status(run)
+    path = run.folder / "result.json"
+    saved = json.loads(path.read_text())
+    saved |= {"task_version": TASKS[run.task].version, "expert_version": None}
+    path.write_text(json.dumps(saved))
+    assert status(run).state == "done"  # no expert took part
 
 
 def test_a_run_that_exceeds_its_time_limit_is_stopped(tmp_path, fake):
