@@ -15,6 +15,7 @@ from ba_torchrl import list_tasks
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, PluginSettings
 from ba_torchrl.commands.report import completed
+from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.leaderboard import LEGEND, Leaderboard, leaderboard, package_runs
 from ba_torchrl.record.report import pipes
 from ba_torchrl.record.results import why_unfinished
@@ -48,10 +49,16 @@ def main(settings: Settings) -> None:
 
 
 def read(roots: Sequence[str]) -> tuple[Leaderboard, list[Path]]:
-    """Return the table with the runs below some folders, and the folders of unfinished runs."""
+    """Return the table with the runs below some folders, and the folders of unfinished runs.
+
+    Raises:
+        ConfigError: there are folders and no run.
+    """
     from ba_torchrl.training.protocol import PROTOCOL  # imports torch, which takes seconds
 
     own, unfinished = load_runs(roots, completed)
+    if roots and not own and not unfinished:
+        raise ConfigError(f"no run below {', '.join(roots)}")
     return leaderboard(package_runs(completed), own, list_tasks(), PROTOCOL), unfinished
 
 

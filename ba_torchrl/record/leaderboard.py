@@ -99,7 +99,7 @@ def leaderboard(
 def _unfit(result: RunResult, tasks: Sequence[str], protocol: int) -> list[str]:
     """Return why a run does not belong to the table."""
     if result.task not in tasks:
-        return ["its task is not registered"]
+        return ["its task is not registered; name its plugins"]
     task = TASKS[result.task]
     present = {
         "task version": (result.task_version, (task.version,)),

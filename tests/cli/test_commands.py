@@ -75,6 +75,7 @@ REFUSED = [
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
     ("plot", "runs=[run]", "cannot read the scalars of run"),
     ("report", "runs=run", "no finished run below run"),
+    ("leaderboard", "runs=demos", "no run below demos"),
     ("report", "folder=file/x", "cannot write to "),
     ("soak", "env.seed=3", "leave it out, and set seed"),
     ("soak", "tasks=[mine/none]", "unknown task 'mine/none'"),
