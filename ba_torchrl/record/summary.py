@@ -84,7 +84,7 @@ class Group:
 
     @property
     def curves(self) -> list[list[CurvePoint]]:
-        """Curves of all seeds, of the same length.
+        """Curves of all seeds that have one, of the same length.
 
         The last point of a run that ended at `stop_at_success` stands for all later ones. The
         untrained policy is left out if a run lacks its evaluation.
@@ -92,6 +92,7 @@ class Group:
         curves = [run.result.curve for run in self.runs]
         if any(curve and curve[0].updates for curve in curves):
             curves = [[point for point in curve if point.updates] for curve in curves]
+        curves = [curve for curve in curves if curve] or [[]]
         length = max(map(len, curves))
         return [curve + curve[-1:] * (length - len(curve)) for curve in curves]
 

@@ -103,6 +103,15 @@ def test_a_run_without_a_curve_is_reported(tmp_path):
     assert "0.500" in (tmp_path / "report" / "table.md").read_text()
 
 
+def test_the_curve_of_a_group_is_of_the_runs_that_have_one(tmp_path):
+    write_run(tmp_path / "0", (), final=0.4)
+    write_run(tmp_path / "1", (0.1, 0.6), seed=1)
+    (group,) = load_sections([tmp_path])[0][0].groups
+    assert group.curve.value.tolist() == [0.1, 0.6]
+    assert group.success.value == pytest.approx(0.5)
+    assert write_report([tmp_path], tmp_path / "report").is_file()
+
+
 def test_curves_begin_with_the_untrained_policy_if_all_runs_have_its_evaluation(tmp_path):
     write_run(tmp_path / "new" / "seed0", (0.2, 0.5, 0.9), updates=(0, 100, 200))
     (section,), _ = load_sections([tmp_path])
