@@ -24,7 +24,7 @@ from ba_torchrl.record.leaderboard import (
     package_runs,
 )
 from ba_torchrl.record.report import pipes, plot_groups
-from ba_torchrl.record.summary import Group, load_runs
+from ba_torchrl.record.summary import Group, Run, load_runs
 from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.protocol import PROTOCOL
@@ -54,14 +54,20 @@ def add(roots: Sequence[str]) -> int:
 
     Returns:
         Their number.
+
+    Raises:
+        ValueError: runs have the same task, label and seed, and with them the same file.
     """
-    runs, _ = load_runs(roots)
-    for run in runs:
-        result = run.result
-        name = f"{result.task} {result.label} seed{result.seed}"
-        path = RECORDS / ("".join(c if c.isalnum() or c in "-." else "_" for c in name) + ".json")
-        write_text(path, result.model_dump_json() + "\n")
-    return len(runs)
+    named: dict[str, Run] = {}
+    for run in load_runs(roots)[0]:
+        name = f"{run.result.task} {run.result.label} seed{run.result.seed}"
+        name = "".join(c if c.isalnum() or c in "-." else "_" for c in name) + ".json"
+        if name in named:
+            raise ValueError(f"{named[name].folder} and {run.folder} are both {name}")
+        named[name] = run
+    for name, run in named.items():
+        write_text(RECORDS / name, run.result.model_dump_json() + "\n")
+    return len(named)
 
 
 def present() -> Leaderboard:

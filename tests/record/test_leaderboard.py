@@ -116,6 +116,9 @@ def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
     for seed in range(2):
         make_run(tmp_path / f"runs/{seed}", seed=seed)
     assert page.add([str(tmp_path / "runs")]) == 2
+    make_run(tmp_path / "runs/other", config={"env": {"robot": "ur5"}})
+    with pytest.raises(ValueError, match=r"runs/0 and .*runs/other are both .*_seed0\.json"):
+        page.add([str(tmp_path / "runs")])
     file = make_run(tmp_path / "file", policy_file="0f", task=PICK, curve=[], env_steps=None)
     file = file.result.model_copy(update={"seconds": None})
     (records / "trained.json").write_text(file.model_dump_json())
