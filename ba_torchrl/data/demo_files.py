@@ -199,6 +199,25 @@ def check_demonstrations(
         raise ConfigError(f"{path} holds {count} episodes, {least} are needed")
 
 
+def recorded_expert(
+    path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None
+) -> int | None:
+    """Return the version of the expert of the demonstrations at ``path``; None if it is not known.
+
+    Args:
+        path: as for `load_demonstrations`.
+        mapping: as for `load_demonstrations`.
+
+    Raises:
+        ConfigError: their files are damaged.
+    """
+    path = Path(path)
+    if not _is_own(path, mapping):
+        return None
+    metadata = read_metadata(path)
+    return None if metadata["source"] == "keyboard" else metadata["expert_version"]
+
+
 def _is_own(path: Path, mapping: object) -> bool:
     """Whether there is a folder that `save_demonstrations` wrote, or, unmapped, nothing known.
 

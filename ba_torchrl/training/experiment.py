@@ -29,6 +29,7 @@ from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.outputs import (
     Result,
     check_packages,
+    expert_version,
     plot_curve,
     record_video,
     write_record,
@@ -144,6 +145,7 @@ class Experiment:
 
     def _demonstrate(self) -> None:
         """Fill the replay with demonstrations."""
+        self._progress.expert_version = expert_version(self.config)
         if self.config.demonstrations:
             self._store_demonstrations()
         self._is_between_updates = True

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from ba_torchrl.algorithms.base import Learner
+from ba_torchrl.data.demo_files import recorded_expert
 from ba_torchrl.data.episodes import Policy
 from ba_torchrl.errors import MissingPackageError, install_command
 from ba_torchrl.hardware import hardware
@@ -110,7 +111,7 @@ def write_record(
             protocol=PROTOCOL,
             task=config.task,
             task_version=task.version,
-            expert_version=task.expert_version if uses_expert(config) else None,
+            expert_version=progress.expert_version,
             label=config.label,
             benchmark=config.benchmark,
             seed=config.seed,
@@ -139,10 +140,14 @@ def write_record(
     )
 
 
-def uses_expert(config: ExperimentConfig) -> bool:
-    """Return whether the task's expert plays demonstrations for a run, or labels its states.
+def expert_version(config: ExperimentConfig) -> int | None:
+    """Return the version of the expert that plays demonstrations for a run, or labels its states.
 
-    Of demonstrations in a folder it is not known.
+    None if there is none, and of demonstrations that do not name it.
     """
-    plays = config.demonstrations > 0 and config.demonstrations_path is None
-    return plays or config.algorithm_config.imitates == "expert_everywhere"
+    present = config.resolved_env.task_class.expert_version
+    if config.algorithm_config.imitates == "expert_everywhere":
+        return present
+    if config.demonstrations and config.demonstrations_path is not None:
+        return recorded_expert(config.demonstrations_path, config.demonstrations_mapping)
+    return present if config.demonstrations else None

@@ -54,6 +54,8 @@ class Progress:
     demonstrations: int = 0
     """Episodes of demonstrations."""
     demonstration_steps: int = 0
+    expert_version: int | None = None
+    """Of the expert that played demonstrations or labels states; None of no or an unknown one."""
     expert_labels: int = 0
     """States of the collection that the expert labelled and the replay stored."""
     phase_seconds: dict[Phase, float] = field(default_factory=dict)

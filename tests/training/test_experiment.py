@@ -19,6 +19,7 @@ from ba_torchrl.data.exchange import export_demonstrations
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import Phase, TestedPolicy, read_result
+from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import protocol
 from ba_torchrl.training.checkpoint import (
     Checkpoints,
@@ -214,6 +215,21 @@ def test_a_result_counts_what_the_run_used(tmp_path, changes, labels, expert):
     used = {name for name, seconds in record.phase_seconds.items() if seconds > 1e-3}
     assert used >= {"updates", "evaluation", "collection", "other"}
     assert ("demonstrations" in used) == bool(config.demonstrations)
+
+
+@pytest.mark.parametrize(("source", "expert"), [("expert", 3), ("keyboard", None)])
+def test_a_result_names_the_expert_of_a_folder(tmp_path, monkeypatch, source, expert):
+    env = {"obs_size": 64, "max_steps": 8}
+    vector = make_vector_env(TINY["task"], 1, parallel=False, seed=0, expert=True, **env)
+    episodes = collect_demonstrations(vector, 3, seed=0)
+    vector.close()
+    path = tmp_path / "demonstrations"
+    with monkeypatch.context() as patch:
+        patch.setattr(TASKS[TINY["task"]], "expert_version", 3)
+        save_demonstrations(path, episodes, task=TINY["task"], env=env, seed=0, source=source)
+    config = tiny(tmp_path, demonstrations_path=str(path), **SHORT)
+    Experiment(config, progress=False).run()
+    assert read_result(config.folder).expert_version == expert
 
 
 def test_a_folder_without_a_run_is_an_error(tmp_path):
