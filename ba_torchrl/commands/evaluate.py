@@ -27,7 +27,8 @@ from ba_torchrl.config import FIRST_TEST_SEED, Which
 from ba_torchrl.data.files import json_bytes, write_text
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.record.results import CITABLE_EPISODES, RunResult, TestedPolicy, wilson_interval
+from ba_torchrl.record.results import CITABLE_EPISODES, RunResult, TestedPolicy
+from ba_torchrl.record.statistics import wilson
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
@@ -144,7 +145,7 @@ def _evaluate(source: str, settings: Settings) -> None:
         found = play(policy, settings, seed, episodes, settings.expert)
     else:
         found = _recorded(policy, settings).last
-    low, high = wilson_interval(sum(found.successes), found.episodes)
+    _, low, high = wilson(found.success_rate, found.episodes)
     print(
         f"success_rate {found.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "
         f"{found.episodes} episodes of {policy.task}, {found.mean_length:.1f} steps each"

@@ -253,14 +253,6 @@ def differences(
     }
 
 
-def wilson_interval(successes: int, episodes: int) -> tuple[float, float]:
-    """Return Wilson's 95 % interval of a success rate."""
-    from scipy.stats import binomtest  # which takes a second to import
-
-    found = binomtest(successes, episodes).proportion_ci(method="wilson")
-    return float(found.low), float(found.high)
-
-
 def versions() -> dict[str, str]:
     """Return the versions of Python and of the packages that affect results.
 

@@ -41,8 +41,8 @@ from ba_torchrl.record.results import (
     now,
     read_result,
     versions,
-    wilson_interval,
 )
+from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 from ba_torchrl.training.checkpoint import (
     Which,
@@ -399,7 +399,7 @@ def _of_test(test: TestedPolicy, protocol: int, precision: str) -> dict[str, Any
     """Return the fields of a card that a test determines."""
     return {
         "success_rate": test.success_rate,
-        "interval": wilson_interval(sum(test.successes), test.episodes),
+        "interval": wilson(test.success_rate, test.episodes)[1:],
         "episodes": test.episodes,
         "protocol": protocol,
         "precision": precision,

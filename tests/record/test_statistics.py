@@ -4,10 +4,9 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import norm
+from scipy.stats import binomtest, norm
 
 from ba_torchrl.record import statistics
-from ba_torchrl.record.results import wilson_interval
 from ba_torchrl.record.statistics import (
     area_under_success,
     mean_curve,
@@ -116,6 +115,12 @@ def test_pairs_of_scenes_narrow_the_interval_of_a_difference():
     assert 2 * width(np.arange(SCENES)) < width(random.permutation(SCENES))
     value, low, high = paired_difference([(runs([first]), runs([first]))], generator())
     assert (value, low, high) == pytest.approx((0, -1.96 / SCENES, 1.96 / SCENES), abs=1e-4)
+
+
+def wilson_interval(successes, episodes):
+    """SciPy's."""
+    found = binomtest(successes, episodes).proportion_ci(method="wilson")
+    return float(found.low), float(found.high)
 
 
 def test_a_single_run_has_the_interval_of_wilson():

@@ -17,6 +17,7 @@ import ba_torchrl
 from ba_torchrl.commands import evaluate
 from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import RunResult, TestedPolicy, read_result
+from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import evaluation, protocol
 from ba_torchrl.training import policy as policies
@@ -202,8 +203,8 @@ def test_wilson_interval():
     centre, scale = p + z**2 / (2 * n), 1 + z**2 / n
     half = z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
     expected = (centre - half) / scale, (centre + half) / scale
-    assert policies.wilson_interval(45, 50) == pytest.approx(expected, abs=1e-6)
-    assert policies.wilson_interval(50, 50)[0] < 1
+    assert wilson(0.9, 50)[1:] == pytest.approx(expected, abs=1e-6)
+    assert wilson(1.0, 50).low < 1
 
 
 def test_what_is_no_policy_is_named(run, tmp_path):

@@ -96,7 +96,7 @@ def test_each_episode_is_that_of_its_seed():
 
 @pytest.mark.parametrize(("faults", "successes"), [(2, 1), (3, 0)])
 def test_an_episode_with_faults_is_repeated_and_then_fails(faults, successes, monkeypatch):
-    """Every episode of one environment has so many faults in its first step."""
+    """The first step of the first episode has ``faults`` faults, one in each attempt."""
     task, options = PICKING
     vector = SerialVectorEnv(1, lambda: make(task, expert=True, obs_size=32, **options))
     original, seen = SerialVectorEnv._step, []
