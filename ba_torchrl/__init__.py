@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from ba_torchrl._lazy import lazy_names
+from ba_torchrl.core.lazy import lazy_names
 from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
-    from ba_torchrl.config import EnvConfig, WorkerOptions
+    from ba_torchrl.core.config import EnvConfig, WorkerOptions
     from ba_torchrl.envs.base import BulletArmEnv
     from ba_torchrl.envs.description import describe
     from ba_torchrl.envs.factory import make, make_vector_env
@@ -19,9 +19,9 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "BulletArmEnv": "envs.base",
-    "EnvConfig": "config",
+    "EnvConfig": "core.config",
     "ResolvedEnv": "envs.settings",
-    "WorkerOptions": "config",
+    "WorkerOptions": "core.config",
     "describe": "envs.description",
     "load_policy": "training.policy",
     "make": "envs.factory",

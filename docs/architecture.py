@@ -13,26 +13,10 @@ from docs.sources import PACKAGE, ROOT, imports, sources
 PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- imports: begin -->\n", "<!-- imports: end -->\n"
 
-BASE = (
-    "errors",
-    "config",
-    "registry",
-    "plugins",
-    "actions",
-    "hardware",
-    "_generators",
-    "_lazy",
-    "_malloc",
-    "_jit",
-)
-"""Single files; one box in the picture."""
-
 
 def part_of(names: list[str]) -> str:
     """Return the box of a module, given the parts of its dotted name below the package."""
-    if not names:
-        return "make"
-    return "base" if names[0] in BASE else names[0]
+    return names[0] if names else "make"
 
 
 def graph() -> dict[str, set[str]]:
@@ -70,12 +54,9 @@ def mermaid() -> str:
     # `make` builds environments, which import nothing of it: the functions import when called
     edges["make"] = {"envs"}
     lines = ["```mermaid", "flowchart TB"]
-    labels = {
-        "base": "errors, config, registry,\\nplugins, actions",
-        "make": "ba_torchrl.make",
-    }
     for part in sorted(edges):
-        lines.append(f'    {part}["{labels.get(part, part + "/")}"]')
+        label = "ba_torchrl.make" if part == "make" else f"{part}/"
+        lines.append(f'    {part}["{label}"]')
     for part, targets in sorted(reduced(edges).items()):
         lines += [f"    {part} --> {target}" for target in sorted(targets)]
     return "\n".join([*lines, "```", ""])

@@ -15,7 +15,7 @@ from sphinx.application import Sphinx
 
 from ba_torchrl import __version__, list_robots, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
-from ba_torchrl.config import EnvConfig
+from ba_torchrl.core.config import EnvConfig
 from ba_torchrl.envs.description import describe, expert_scores, summary
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.record.task_page import tasks_by_heading

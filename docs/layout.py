@@ -14,7 +14,7 @@ from __future__ import annotations
 from docs.sources import PACKAGE, ROOT, Definition, definitions, sources
 
 MOST_LINES, MOST_LEVELS = 400, 2
-SETTINGS = Definition(f"{PACKAGE}.config", "StrictModel")
+SETTINGS = Definition(f"{PACKAGE}.core.config", "StrictModel")
 """Base of all settings, as pydantic's `BaseModel`; it is no level."""
 SUBJECTS = {
     "close_loop/block_stacking with its expert": (

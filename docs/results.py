@@ -13,7 +13,7 @@ import sys
 from collections.abc import Iterator, Sequence
 
 from ba_torchrl.commands.report import completed
-from ba_torchrl.data.files import write_text
+from ba_torchrl.core.files import write_text
 from ba_torchrl.envs.description import describe
 from ba_torchrl.record.leaderboard import (
     LEGEND,

@@ -10,7 +10,7 @@ import sys
 from hashlib import sha256
 from pathlib import Path
 
-from ba_torchrl.data.files import json_bytes, write_text
+from ba_torchrl.core.files import json_bytes, write_text
 from ba_torchrl.record.leaderboard import RECORDS
 from ba_torchrl.record.results import RunResult
 from ba_torchrl.training.policy import CARD, read_card, shipped_file, tested_card

@@ -20,8 +20,8 @@ from pathlib import Path
 from typing import Any
 
 from ba_torchrl.cli.types import check_writable_file
-from ba_torchrl.data.files import write_text
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import write_text
 from profiling.fingerprint.cases import PARTS, cases
 from profiling.fingerprint.compare import compare, read_record
 from profiling.fingerprint.record import run_all, versions

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 from gymnasium import spaces
 
-from ba_torchrl.data.formats.base import FORMATS, Entry
+from ba_torchrl.demonstrations.formats.base import FORMATS, Entry
 from ba_torchrl.envs.gym import GymEnv
 
 TASKS = ("close_loop/block_picking", "close_loop/block_stacking")

@@ -7,7 +7,7 @@ python recipes/measure.py which=learning/equi_sdqfd_update profile=true
 python recipes/measure.py which=learning device=cuda
 """
 
-from ba_torchrl._malloc import tune_malloc
+from ba_torchrl.core.malloc import tune_malloc
 
 tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
 

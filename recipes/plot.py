@@ -9,7 +9,7 @@ import numpy as np
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, PluginSettings, PngFile
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.training.checkpoint import read_config

@@ -4,7 +4,7 @@ import functools
 import pytest
 import torch
 
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.core.errors import MissingPackageError
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 
 with contextlib.suppress(MissingPackageError):  # else `importorskip("escnn")` skips its tests

@@ -10,7 +10,7 @@ from tensordict.nn import (
 from torch import nn
 from torchrl.objectives import SoftUpdate
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.objectives.sacfd import SACfDLoss
 
 

@@ -4,7 +4,7 @@ import pytest
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 
-from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.base import ActorCriticSpec
 from ba_torchrl.modules.spatial.base import SpatialSpec
 

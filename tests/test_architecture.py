@@ -41,15 +41,15 @@ def test_examples_and_files_exist():
 
 
 def test_the_lines_to_read_are_those_of_what_is_named():
-    registry = Definition("ba_torchrl.registry", "Registry")
-    error = Definition("ba_torchrl.errors", "UnknownNameError")
+    registry = Definition("ba_torchrl.core.registry", "Registry")
+    error = Definition("ba_torchrl.core.errors", "UnknownNameError")
     assert error in registry.uses
-    assert error not in layout.to_read(registry, ("ba_torchrl.registry",))
-    assert error in layout.to_read(registry, ("ba_torchrl.registry", "ba_torchrl.errors"))
+    assert error not in layout.to_read(registry, ("ba_torchrl.core.registry",))
+    assert error in layout.to_read(registry, ("ba_torchrl.core.registry", "ba_torchrl.core.errors"))
     for entry, folders in layout.SUBJECTS.values():
         assert sum(each.lines for each in layout.to_read(entry, folders)) > 500
 
 
 def test_levels_of_classes_do_not_count_the_base_of_settings():
-    assert layout.levels(Definition("ba_torchrl.errors", "UnknownNameError")) == 1
-    assert layout.levels(Definition("ba_torchrl.config", "EnvConfig")) == 0
+    assert layout.levels(Definition("ba_torchrl.core.errors", "UnknownNameError")) == 1
+    assert layout.levels(Definition("ba_torchrl.core.config", "EnvConfig")) == 0

@@ -9,8 +9,8 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ba_torchrl.algorithms import base as registries
-from ba_torchrl.config import parse
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 

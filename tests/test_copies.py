@@ -18,14 +18,14 @@ from torchrl.collectors import MultiSyncCollector
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
-from ba_torchrl.data import (
-    SymmetricSampler,
+from ba_torchrl.data import SymmetricSampler
+from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.demonstrations import (
     collect_demonstrations,
     load_demonstrations,
     save_demonstrations,
 )
-from ba_torchrl.data.demos import RandomActions, source_config
-from ba_torchrl.data.replay.make import ReplayKind
+from ba_torchrl.demonstrations.collect import RandomActions, source_config
 from ba_torchrl.training.policy import read_card, shipped_file
 from tests.algorithms.tiny import build, transitions
 

@@ -5,14 +5,14 @@ import torch
 from torchrl.envs.utils import check_env_specs
 
 import ba_torchrl
+from ba_torchrl.core import keys
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.augmentation.views import RandomViews
-from ba_torchrl.data.demos import collect_demonstrations, source_config
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.envs import keys
+from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 

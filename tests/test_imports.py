@@ -13,52 +13,42 @@ import tomllib
 ROOT = Path(__file__).parents[1]
 PACKAGE = "ba_torchrl"
 
-BASE = {"errors", "config", "plugins", "registry", "actions"}
 # Each part may import itself, what comes before it, and what EXTRA names. `__init__` is the
 # package itself, whose functions make environments.
-CHAIN = ["sim", "tasks", "envs", "data", "algorithms", "training", "cli", "commands", "recipes"]
+CHAIN = ["core", "sim", "tasks", "envs", "demonstrations", "algorithms", "training", "cli"]
+CHAIN += ["commands", "recipes"]
 EXTRA = {
-    "data": {"__init__"},
-    "algorithms": {"__init__", "modules", "objectives"},
-    "training": {"__init__", "record", "hardware"},
+    "demonstrations": {"__init__"},
+    "algorithms": {"__init__", "data", "modules", "objectives"},
+    "training": {"__init__", "data", "record"},
     "cli": {"__init__", "record"},
-    "commands": {"__init__", "record", "hardware", "modules"},
+    "commands": {"__init__", "data", "record", "modules"},
     "__main__": {"cli"},
     "recipes": {"__init__", "record"},
 }
-SHARED = {"_generators", "_lazy", "_malloc", "_jit"}
 APART = {
-    "__init__": BASE | {"sim", "tasks", "envs", "training.policy"},
+    "__init__": {"core", "sim", "tasks", "envs", "training.policy"},
     "__main__": {"cli"},
-    "testing": BASE | {"testing", "sim", "tasks", "envs", "__init__"},
-    "modules": BASE | {"modules", "envs.keys", "envs.images", "hardware"},
-    "objectives": BASE | {"objectives", "envs.keys"},
-    "record": BASE | {"record", "sim", "tasks", "envs", "data", "__init__"},
-    "_generators": set(),
-    "_lazy": set(),
-    "_malloc": set(),
-    "_jit": set(),
-    "hardware": set(),
+    "testing": {"core", "testing", "sim", "tasks", "envs", "__init__"},
+    "data": {"core", "data"},
+    "modules": {"core", "modules"},
+    "objectives": {"core", "objectives"},
+    "record": {"core", "record", "sim", "tasks", "envs", "demonstrations", "__init__"},
     # measurements, which read every part
-    "recipes.profiling": BASE
-    | {"__init__", "sim", "tasks", "envs", "data", "modules", "objectives", "algorithms"}
-    | {"training", "record", "hardware"},
+    "recipes.profiling": {"core", "__init__", "sim", "tasks", "envs", "demonstrations", "data"}
+    | {"modules", "objectives", "algorithms", "training", "record"},
     # whole algorithms as scripts: no learner and no experiment
-    "recipes.torchrl": BASE | {"envs", "data", "modules", "objectives", "__init__"},
+    "recipes.torchrl": {"core", "envs", "demonstrations", "data", "modules", "objectives"}
+    | {"__init__"},
 }
 LEARNING = {"torch", "tensordict", "torchrl"}
-FORBIDDEN_PACKAGES = dict.fromkeys(("sim", "tasks", *BASE), LEARNING)
+FORBIDDEN_PACKAGES = dict.fromkeys(("sim", "tasks"), LEARNING)
 
 
 def allowed_parts(part):
     if part in APART:
-        return APART[part] | SHARED
-    if part == "errors":
-        return set()
-    if part in BASE:
-        return BASE | SHARED
-    before = set(CHAIN[: CHAIN.index(part) + 1])
-    return BASE | SHARED | before | EXTRA.get(part, set())
+        return APART[part]
+    return set(CHAIN[: CHAIN.index(part) + 1]) | EXTRA.get(part, set())
 
 
 def part_of(module):
@@ -199,7 +189,7 @@ def test_a_circle_between_files_is_found():
         ("ba_torchrl.tasks.base", "from tensordict import TensorDict", "tensordict"),
         ("ba_torchrl.tasks.base", "from ..envs import keys", "envs"),
         ("ba_torchrl.tasks.base", "from ba_torchrl import envs", "envs"),
-        ("ba_torchrl.registry", "from ba_torchrl.sim import world", "sim"),
+        ("ba_torchrl.core.registry", "from ba_torchrl.sim import world", "sim"),
         (
             "ba_torchrl.envs.base",
             "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n"
@@ -217,7 +207,7 @@ def test_a_circle_between_files_is_found():
         ("ba_torchrl.training.loop", "from ba_torchrl.modules.cnn import CNN", "modules"),
         ("ba_torchrl.algorithms.sac", "from ba_torchrl.record.plots import plot", "record"),
         ("ba_torchrl.envs.base", "from ba_torchrl import make", "__init__"),
-        ("ba_torchrl._malloc", "from ba_torchrl.config import EnvConfig", "config"),
+        ("ba_torchrl.modules.cnn", "from ba_torchrl.data import as_transitions", "data"),
         ("recipes.train", "from ba_torchrl.modules.cnn import CNN", "modules"),
         ("recipes.torchrl.sac", "from ba_torchrl.algorithms.sac import SAC", "algorithms"),
         ("recipes.torchrl.sac", "from ba_torchrl.training import experiment", "training"),
@@ -233,15 +223,15 @@ def test_a_wrong_import_is_found(module, source, culprit):
     ("module", "source"),
     [
         ("ba_torchrl.sim.robots.kuka", "import numpy\nfrom ..world import World"),
-        ("ba_torchrl.modules.cnn", "import torch\nfrom ba_torchrl.envs import keys"),
-        ("ba_torchrl.modules.cnn", "from ba_torchrl.envs.keys import ACTION"),
+        ("ba_torchrl.modules.cnn", "import torch\nfrom ba_torchrl.core import keys"),
+        ("ba_torchrl.modules.cnn", "from ba_torchrl.core.keys import ACTION"),
         ("ba_torchrl.algorithms.sac", "from ba_torchrl.modules.cnn import CNN"),
         ("ba_torchrl.training.loop", "from ba_torchrl import make\nimport ba_torchrl.record.plots"),
-        ("recipes.train", "from ba_torchrl._malloc import tune_malloc"),
+        ("recipes.train", "from ba_torchrl.core.malloc import tune_malloc"),
     ],
 )
 def test_a_right_import_passes(module, source):
-    assert violations(source, module, {"ba_torchrl.envs.keys"}) == []
+    assert violations(source, module, {"ba_torchrl.core.keys"}) == []
 
 
 def test_a_new_part_must_be_given_a_place():

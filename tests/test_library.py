@@ -10,7 +10,7 @@ from torchrl.envs import Compose, ParallelEnv, RewardScaling, StepCounter, Trans
 
 import ba_torchrl
 from ba_torchrl import data, envs, modules, objectives
-from ba_torchrl.errors import install_command
+from ba_torchrl.core.errors import install_command
 
 REACH = "close_loop/block_reaching"
 
@@ -53,7 +53,7 @@ def test_a_torchrl_script_works_as_torchrls_documentation_says():
 
 def test_the_command_that_installs_a_package_has_its_bounds(monkeypatch):
     monkeypatch.setattr(
-        "ba_torchrl.errors.requires", lambda _: ['hydra-core<1.4,>=1.3.2; extra == "train"']
+        "ba_torchrl.core.errors.requires", lambda _: ['hydra-core<1.4,>=1.3.2; extra == "train"']
     )
     found = install_command("hydra-core", "other")
     assert found == "pip install 'hydra-core<1.4,>=1.3.2' other"

@@ -6,7 +6,7 @@ import sys
 import numpy as np
 import pytest
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import read_failure
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, Decomposition, cached_parts
 from ba_torchrl.sim.assets.graspnet import read_mesh

@@ -12,7 +12,7 @@ import pytest
 
 from ba_torchrl.cli import command_names, main
 from ba_torchrl.cli.command import Command
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from tests.fresh import run_script
 
 ROOT = Path(__file__).resolve().parents[1]

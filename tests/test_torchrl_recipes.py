@@ -16,8 +16,8 @@ from torchrl.checkpoint import Checkpoint
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
 import ba_torchrl
+from ba_torchrl.core import keys
 from ba_torchrl.data import ImageCodecs, as_transitions
-from ba_torchrl.envs import keys
 
 FOLDER = Path(__file__).parents[1] / "recipes" / "torchrl"
 REACH = "close_loop/block_reaching"
@@ -103,7 +103,13 @@ def test_a_pool_collects_the_same_demonstrations(backend, capsys):
     assert (batch == again).all()
 
 
-PUBLIC = {"ba_torchrl", *(f"ba_torchrl.{n}" for n in ("data", "envs", "modules", "objectives"))}
+PUBLIC = {
+    "ba_torchrl",
+    *(
+        f"ba_torchrl.{n}"
+        for n in ("core", "data", "demonstrations", "envs", "modules", "objectives")
+    ),
+}
 
 
 @pytest.mark.parametrize("path", sorted(FOLDER.glob("*.py")), ids=lambda path: path.stem)

@@ -151,7 +151,7 @@ def check_expert(task: str) -> None:
     from torchrl.envs.utils import check_env_specs
 
     import ba_torchrl
-    from ba_torchrl.data import expert_policy
+    from ba_torchrl.demonstrations import expert_policy
 
     env = ba_torchrl.make(task, seed=0, expert=True)
     try:
@@ -228,7 +228,7 @@ def updates() -> list[tuple[str, object]]:
 
 def check_update(values: dict[str, object]) -> None:
     """Take an update on two demonstrations."""
-    from ba_torchrl.data import collect_demonstrations
+    from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.envs.factory import make_vector_env
     from ba_torchrl.training.checkpoint import build_algorithm
     from ba_torchrl.training.config import ExperimentConfig

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.modules.steerable.layers import reuse_filters
 
 

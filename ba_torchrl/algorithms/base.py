@@ -28,25 +28,25 @@ from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.trainers import OptimizationStepper
 from typing_extensions import Self
 
-from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.optimizers import LossFunction, Optimizers, Update
-from ba_torchrl.config import StrictModel, changed
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.core.config import StrictModel, changed
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.images import ImageSpec
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.make import ReplayKind, make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device, to_device
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation, as_transitions
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
 from ba_torchrl.modules.layers import compute_dtype
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
-from ba_torchrl.registry import Registry
 
 __all__ = [
     "ALGORITHMS",

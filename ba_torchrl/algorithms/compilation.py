@@ -13,9 +13,9 @@ from torchrl.envs.utils import set_exploration_type
 from torchrl.modules import set_recurrent_mode
 from torchrl.objectives import LossModule
 
-from ba_torchrl.config import CompileMode
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import CompileMode
+from ba_torchrl.core.errors import ConfigError
 
 
 def check_compiler(device: torch.device) -> None:

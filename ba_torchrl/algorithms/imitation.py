@@ -19,16 +19,16 @@ from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
-from ba_torchrl._generators import seeded_generator
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
 from ba_torchrl.algorithms.spatial_actions import (
     RigidAugmentationConfig,
     demonstration_on_grid,
     make_spatial_values,
 )
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.data.transitions import Imitation
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialPolicy, spatial_policy

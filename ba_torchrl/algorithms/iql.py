@@ -18,8 +18,8 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem
+from ba_torchrl.core import keys
 from ba_torchrl.data.transitions import Imitation
-from ba_torchrl.envs import keys
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.gaussian_policy import truncated_gaussian_policy
 from ba_torchrl.modules.base import NetworkConfig

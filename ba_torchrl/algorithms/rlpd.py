@@ -18,8 +18,8 @@ from torch.optim.lr_scheduler import LinearLR
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Problem, SeedUse
 from ba_torchrl.algorithms.sac import SAC, SACConfig
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.transitions import Imitation
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
 from ba_torchrl.objectives.rlpd import RLPDLoss

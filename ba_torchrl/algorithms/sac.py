@@ -26,7 +26,10 @@ from ba_torchrl.algorithms.base import (
     Problem,
     SeedUse,
 )
-from ba_torchrl.config import changed
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import changed
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
 from ba_torchrl.data.augmentation.views import (
     CenterCrop,
@@ -34,11 +37,8 @@ from ba_torchrl.data.augmentation.views import (
     ViewTransform,
     cropped_images,
 )
-from ba_torchrl.data.episodes import EpisodeAssembler
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.demonstrations.episodes import EpisodeAssembler
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
 from ba_torchrl.objectives.imitation import ActionDistance

@@ -9,12 +9,12 @@ from pydantic import Field
 from tensordict import TensorDictBase
 from torchrl.envs import Transform
 
-from ba_torchrl.actions import OpenLoopActions
 from ba_torchrl.algorithms.base import LearnerConfig, Problem, SeedUse
-from ba_torchrl.config import changed
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import OpenLoopActions
+from ba_torchrl.core.config import changed
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.base import SpatialSpec
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues

@@ -19,7 +19,7 @@ from ba_torchrl.algorithms.spatial_actions import (
     demonstration_on_grid,
     make_spatial_values,
 )
-from ba_torchrl.config import changed
+from ba_torchrl.core.config import changed
 from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.base import NetworkConfig

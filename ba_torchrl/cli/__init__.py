@@ -16,8 +16,8 @@ from pathlib import Path
 from types import ModuleType
 
 from ba_torchrl import __version__
-from ba_torchrl._malloc import tune_malloc
-from ba_torchrl.errors import install_command, known_names
+from ba_torchrl.core.errors import install_command, known_names
+from ba_torchrl.core.malloc import tune_malloc
 
 PROGRAM = "ba-torchrl"
 EXIT_CODE = 2

@@ -26,9 +26,9 @@ from pydantic import BaseModel
 from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import name_presets, plain_errors
 from ba_torchrl.cli.help import describe
-from ba_torchrl.config import parse
-from ba_torchrl.errors import ConfigError, known_names
-from ba_torchrl.plugins import has_entry_points, load_plugins
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.plugins import has_entry_points, load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig

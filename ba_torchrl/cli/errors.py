@@ -14,7 +14,7 @@ from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ba_torchrl.cli import EXIT_CODE, ends_with_reader
-from ba_torchrl.errors import ConfigError, as_os_error
+from ba_torchrl.core.errors import ConfigError, as_os_error
 from ba_torchrl.training import hydra_schema
 
 _RESOURCES = {

@@ -15,8 +15,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
-from ba_torchrl.config import EnvConfig, env_config_model
-from ba_torchrl.data.formats.base import FORMATS
+from ba_torchrl.core.config import EnvConfig, env_config_model
+from ba_torchrl.demonstrations.formats.base import FORMATS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS

@@ -13,9 +13,9 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ba_torchrl.config import MAX_ENVS, MAX_SEED, StrictModel
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import load_plugins
+from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, StrictModel
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.base import check_has_structure
 

@@ -21,7 +21,7 @@ from pydantic import Field
 
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig, choose

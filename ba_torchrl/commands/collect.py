@@ -30,10 +30,10 @@ from ba_torchrl.cli.types import (
     check_writable_file,
     check_writable_folder,
 )
-from ba_torchrl.config import Source, changed
-from ba_torchrl.data.files import complete_only
+from ba_torchrl.core.config import Source, changed
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import complete_only
 from ba_torchrl.envs.settings import check_env, resolve_env
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.tasks.structures.base import check_has_structure
 
@@ -121,7 +121,7 @@ def main(settings: Settings) -> None:
 
 def _collect_graded(settings: Settings) -> None:
     """Make every set that is missing; a task that has no medium policy does not stop the others."""
-    from ba_torchrl.data.demo_files import read_metadata
+    from ba_torchrl.demonstrations.demo_files import read_metadata
     from ba_torchrl.training.graded import ACCEPTED, GRADES
 
     problems = []
@@ -150,15 +150,15 @@ def _collect(settings: Settings) -> None:
     (task,) = settings.task
     check_env(task, settings.env)  # before the import of torch
     from ba_torchrl import make_vector_env
-    from ba_torchrl.data.demo_files import save_demonstrations
-    from ba_torchrl.data.demos import (
+    from ba_torchrl.demonstrations.collect import (
         check_noise,
         check_turn_noise,
         collect_demonstrations,
         source_config,
     )
-    from ba_torchrl.data.episodes import is_success, mean_length, success_rate
-    from ba_torchrl.data.time_reversal import replay_scores
+    from ba_torchrl.demonstrations.demo_files import save_demonstrations
+    from ba_torchrl.demonstrations.episodes import is_success, mean_length, success_rate
+    from ba_torchrl.demonstrations.time_reversal import replay_scores
 
     path = settings.folder
     actions = resolve_env(task, settings.env).actions

@@ -15,9 +15,9 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import NamedTuple
 
 from ba_torchrl import __version__
-from ba_torchrl._malloc import tune_malloc
 from ba_torchrl.cli import EXIT_CODE, OF_TRAINING, config_dir
-from ba_torchrl.errors import MissingPackageError, install_command
+from ba_torchrl.core.errors import MissingPackageError, install_command
+from ba_torchrl.core.malloc import tune_malloc
 
 NEEDED = (
     "torch",
@@ -113,7 +113,7 @@ def _escnn() -> Finding:
 def _cpu() -> Finding:
     import torch
 
-    from ba_torchrl.hardware import hardware
+    from ba_torchrl.core.hardware import hardware
 
     found = hardware(torch.device("cpu"))
     return Finding("cpu", f"{found['cpu']}, {found['cores']} cores, {found['memory_gb']} GB")

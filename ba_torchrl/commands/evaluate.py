@@ -23,9 +23,9 @@ from ba_torchrl.cli.types import (
     VectorSettings,
     VideoFile,
 )
-from ba_torchrl.config import FIRST_TEST_SEED, Which
-from ba_torchrl.data.files import json_bytes, write_text
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import FIRST_TEST_SEED, Which
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import json_bytes, write_text
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import CITABLE_EPISODES, RunResult, TestedPolicy
 from ba_torchrl.record.statistics import wilson

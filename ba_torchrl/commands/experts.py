@@ -24,8 +24,8 @@ from ba_torchrl.cli.types import (
     checked,
     without,
 )
-from ba_torchrl.data.files import write_text
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import write_text
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
@@ -122,7 +122,7 @@ def _table_of(task: str, variants: dict[str, Any]) -> str:
 
 
 def _cell(task: str, settings: Settings, env: dict[str, Any]) -> str:
-    from ba_torchrl.data.demos import expert_scores
+    from ba_torchrl.demonstrations.collect import expert_scores
 
     try:
         scores = expert_scores(

@@ -21,9 +21,9 @@ from pydantic import Field
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Text, check_writable_file, checked
 from ba_torchrl.commands import evaluate
-from ba_torchrl.config import changed
-from ba_torchrl.data.formats.base import FORMATS, card_file
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import changed
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.demonstrations.formats.base import FORMATS, card_file
 
 _OF_POLICIES = ("which", "device", "episodes", "num_envs", "parallel")
 
@@ -47,8 +47,8 @@ class Settings(evaluate.EpisodeSettings):
 
 def main(settings: Settings) -> None:
     """Write a policy, or demonstrations."""
-    from ba_torchrl.data.demo_files import read_demonstrations
-    from ba_torchrl.data.exchange import export_demonstrations
+    from ba_torchrl.demonstrations.demo_files import read_demonstrations
+    from ba_torchrl.demonstrations.exchange import export_demonstrations
 
     if (settings.policy is None) == (settings.demos is None):
         raise ConfigError("name either a policy or demos=FOLDER")

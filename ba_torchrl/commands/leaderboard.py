@@ -15,7 +15,7 @@ from ba_torchrl import list_tasks
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, PluginSettings
 from ba_torchrl.commands.report import completed
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.leaderboard import LEGEND, Leaderboard, leaderboard, package_runs
 from ba_torchrl.record.report import pipes
 from ba_torchrl.record.results import why_unfinished

@@ -20,16 +20,16 @@ from typing import TYPE_CHECKING, Annotated, ClassVar
 
 from pydantic import Field
 
-from ba_torchrl.actions import CloseLoopActions
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NewPath, TaskId, Text, VideoFile
-from ba_torchrl.data.files import complete_only
+from ba_torchrl.core.actions import CloseLoopActions
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import complete_only
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
 
 if TYPE_CHECKING:
-    from ba_torchrl.data.episodes import Policy
+    from ba_torchrl.demonstrations.episodes import Policy
 
 
 class Settings(EnvSettings):
@@ -88,7 +88,7 @@ def _print_episode(number: int, steps: int, is_success: bool) -> None:
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
     """Return the environment and the policy that acts, None for random actions."""
     from ba_torchrl import load_policy
-    from ba_torchrl.data.demos import expert_policy
+    from ba_torchrl.demonstrations.collect import expert_policy
 
     is_loaded = settings.policy not in ("expert", "random")
     if settings.task is None and (not is_loaded or settings.policy == "trained"):
@@ -106,9 +106,9 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
 def _record_keyboard(settings: Settings) -> None:
     """Write the episodes that a person plays, the complete ones if it is interrupted."""
     from ba_torchrl import make
-    from ba_torchrl.data.demo_files import save_demonstrations
-    from ba_torchrl.data.episodes import success_rate
-    from ba_torchrl.data.teleoperation import Keyboard, KeyEvents, record_demonstrations
+    from ba_torchrl.demonstrations.demo_files import save_demonstrations
+    from ba_torchrl.demonstrations.episodes import success_rate
+    from ba_torchrl.demonstrations.teleoperation import Keyboard, KeyEvents, record_demonstrations
 
     if settings.task is None or settings.path is None:
         missing = "task" if settings.task is None else "path, a folder for the demonstrations,"

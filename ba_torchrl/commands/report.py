@@ -16,8 +16,8 @@ from omegaconf import OmegaConf
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, OutputFolder, check_writable_folder
 from ba_torchrl.commands import benchmark as benchmark_command
-from ba_torchrl.config import StrictModel
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import NON_LEARNING_FIELDS, RunResult, differences, run_folders
 from ba_torchrl.record.summary import Axis

@@ -84,7 +84,7 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
         parallel: one process per environment.
     """
     from ba_torchrl import make_vector_env
-    from ba_torchrl.data import expert_policy
+    from ba_torchrl.demonstrations import expert_policy
 
     env = make_vector_env(
         task,
@@ -139,7 +139,7 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
         settings: of the measurement.
     """
     from ba_torchrl import make_vector_env
-    from ba_torchrl.data import collect_demonstrations
+    from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.training.checkpoint import build_algorithm
     from ba_torchrl.training.duration import WARM_UP_UPDATES
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from ba_torchrl import describe, list_tasks
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks, check_untracked
-from ba_torchrl.data.files import write_text
+from ba_torchrl.core.files import write_text
 from ba_torchrl.envs.description import summary
 from ba_torchrl.record.task_page import task_page, tasks_by_heading
 

@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 
 Imitation = Literal["none", "executed", "expert", "expert_everywhere"]
 """Which action an algorithm imitates, and on which transitions:

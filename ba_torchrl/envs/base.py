@@ -14,12 +14,13 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 from torchrl.envs.utils import _classproperty
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.checks import ChecksPolicy, checked_action
 from ba_torchrl.envs.copying import CopiesWithState
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_bodies, check_observation
-from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.observations import (
     enabled_observations,
     merge_entries,
@@ -28,7 +29,6 @@ from ba_torchrl.envs.observations import (
 from ba_torchrl.envs.rendering import WORKSPACE_VIEW, Direction, RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
-from ba_torchrl.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
@@ -70,8 +70,8 @@ class BulletArmEnv(ChecksPolicy, CopiesWithState, EnvBase, metaclass=_MadeByTask
     Args:
         task: one of `available_envs`, or what `resolve_env` returned.
         device: of its TensorDicts, the CPU by default. The simulation is on the CPU.
-        config: fields of `ba_torchrl.config.EnvConfig`, such as ``robot="kuka"``, ``seed=0`` or
-            ``expert=True``.
+        config: fields of `ba_torchrl.core.config.EnvConfig`, such as ``robot="kuka"``,
+            ``seed=0`` or ``expert=True``.
 
     Raises:
         ConfigError: the task or a parameter is unknown, its value cannot be used, or the workspace

@@ -10,8 +10,8 @@ from tensordict import TensorDictBase
 from torchrl.data import TensorSpec
 from torchrl.envs import EnvBase
 
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import InvalidActionError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import InvalidActionError
 
 
 class ChecksPolicy:

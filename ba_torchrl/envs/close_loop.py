@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torchrl.data import Bounded
 
-from ba_torchrl.actions import CloseLoopActions
-from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import CloseLoopActions
+from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.images import Frame, ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
-from ba_torchrl.envs.images import Frame, ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv

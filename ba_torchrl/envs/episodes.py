@@ -10,9 +10,9 @@ import numpy as np
 import torch
 from typing_extensions import Self
 
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.envs.faults import check_bodies
 from ba_torchrl.envs.scene import Scene, SceneState
-from ba_torchrl.errors import PlacementError
 
 RESET_ATTEMPTS = 50
 MAX_REFUSED = 5

@@ -10,12 +10,12 @@ from typing import Any, overload
 from torchrl.envs import EnvBase
 from typing_extensions import Unpack
 
-from ba_torchrl.config import EnvKeywords, WorkerOptions, parse
+from ba_torchrl.core.config import EnvKeywords, WorkerOptions, parse
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import module_names
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.envs.vector.make import make_vector, processes_save_time
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import module_names
 
 
 @overload
@@ -49,7 +49,7 @@ def make_vector_env(
             environment, such as ``["my_tasks"]``. Those that register the task and the robot are
             found without being named.
         make: makes one environment; a function or class that the processes can import.
-        options: as for `make`, and single fields of `ba_torchrl.config.WorkerOptions`, such as
+        options: as for `make`, and single fields of `ba_torchrl.core.config.WorkerOptions`, such as
             ``parallel=False`` or ``timeout_s=120``.
 
     Raises:

@@ -15,8 +15,8 @@ from collections.abc import Mapping
 import torch
 from tensordict import NonTensorData
 
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.errors import SimulationError
 
 logger = logging.getLogger(__name__)
 

@@ -14,10 +14,10 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from typing_extensions import Self
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError, InvalidActionError
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError, InvalidActionError
 
 Observation = dict[str, np.ndarray]
 
@@ -44,7 +44,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         task: as listed by `ba_torchrl.list_tasks`.
         render_mode: ``rgb_array`` for images from `render`, ``human`` for PyBullet's window.
         register_modules: names of modules outside the package that register the task or its robot.
-        config: fields of `ba_torchrl.config.EnvConfig`.
+        config: fields of `ba_torchrl.core.config.EnvConfig`.
 
     Raises:
         ConfigError: the task or a parameter is unknown, or its value cannot be used.

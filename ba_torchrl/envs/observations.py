@@ -15,12 +15,12 @@ from tensordict import NonTensorData
 from torch import Tensor
 from torchrl.data import Bounded, NonTensor, TensorSpec, Unbounded
 
-from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.images import ImageSpec
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.registry import Registry
 from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses, wrist_lens
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_owners, render_rgbd

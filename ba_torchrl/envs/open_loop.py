@@ -11,17 +11,17 @@ import numpy as np
 import torch
 from torchrl.data import Bounded
 
-from ba_torchrl.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
-from ba_torchrl.config import EnvConfig
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
+from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.episodes import SETTLE_STEPS
-from ba_torchrl.envs.images import ImageSpec
 from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.rendering import ARM_VIEW, DISPLAY_POINT, DISPLAY_YAW_RAD, ArmDisplay
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits
 from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import Robot

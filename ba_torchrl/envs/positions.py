@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import SimulationError
 
 Position = dict[str, Any]
 """``seed``; ``episode``, the number of the first of some episodes; and ``actions``, float32

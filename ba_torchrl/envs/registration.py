@@ -14,8 +14,8 @@ from importlib.machinery import ModuleSpec
 from types import ModuleType
 from typing import Any
 
-from ba_torchrl.plugins import MAIN
-from ba_torchrl.registry import call_on_registration
+from ba_torchrl.core.plugins import MAIN
+from ba_torchrl.core.registry import call_on_registration
 
 NAMESPACE = "BulletArm"
 ENTRY_POINT = "ba_torchrl.envs.gym:GymEnv"

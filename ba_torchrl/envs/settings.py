@@ -7,11 +7,11 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
-from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.config import EnvConfig, env_config_model, parse
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import MAIN, check_spawned_process_knows, import_modules
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.core.config import EnvConfig, env_config_model, parse
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import MAIN, check_spawned_process_knows, import_modules
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
 from ba_torchrl.tasks.base import TASKS, Task, TaskSettings, check_scales
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 from torch import nn
 
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.registry import Registry
+from ba_torchrl.core import keys
+from ba_torchrl.core.images import ImageSpec
+from ba_torchrl.core.registry import Registry
 
 Control = Literal["open_loop", "close_loop"]
 

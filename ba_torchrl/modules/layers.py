@@ -11,7 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl import hardware
+from ba_torchrl.core import hardware
 
 Value = TypeVar("Value")
 

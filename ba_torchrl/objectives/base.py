@@ -15,7 +15,7 @@ from torchrl.objectives import LossModule, ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from typing_extensions import Self
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 
 Reduction = Literal["none", "mean", "sum"]
 """How the losses of a batch's samples are combined, as in TorchRL."""

@@ -12,7 +12,7 @@ from tensordict.utils import NestedKey
 from torch import Tensor, nn
 from torchrl.modules import QValueActor
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]

@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.objectives.dqn import LevelValues
 
 ActionDistance = Literal["mse", "kl"]

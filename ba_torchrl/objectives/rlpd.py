@@ -9,7 +9,7 @@ from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from torch import Tensor
 
-from ba_torchrl._generators import seeded_generator
+from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.objectives.sacfd import SACfDLoss
 
 

@@ -17,7 +17,7 @@ from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.objectives.sac import compute_rsample_log_prob
 from typing_extensions import Self
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
 from ba_torchrl.objectives.imitation import ActionDistance, action_distance
 

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from ba_torchrl import make
-from ba_torchrl.data.files import replaced
-from ba_torchrl.data.time_reversal import make_deconstruction_env
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.files import replaced
+from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
 

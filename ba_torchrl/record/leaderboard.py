@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
-from ba_torchrl.data.files import json_bytes
+from ba_torchrl.core.files import json_bytes
 from ba_torchrl.record.results import CITABLE_EPISODES, RunResult
 from ba_torchrl.record.summary import DIRECTION, ENOUGH_SEEDS, Completed, Group, Run, grouped
 from ba_torchrl.tasks.base import TASKS

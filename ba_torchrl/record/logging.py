@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from ba_torchrl.errors import MissingPackageError, install_command
+from ba_torchrl.core.errors import MissingPackageError, install_command
 from ba_torchrl.record.results import flat
 
 if TYPE_CHECKING:

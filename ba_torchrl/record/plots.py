@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.data.files import replaced
-from ba_torchrl.errors import MissingPackageError, install_command
+from ba_torchrl.core.errors import MissingPackageError, install_command
+from ba_torchrl.core.files import replaced
 from ba_torchrl.record.logging import read_scalars
 
 if TYPE_CHECKING:

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from jinja2 import Environment
 
-from ba_torchrl.data.files import replaced, write_text
+from ba_torchrl.core.files import replaced, write_text
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.results import CITABLE_EPISODES, now, why_unfinished
 from ba_torchrl.record.statistics import CONFIDENCE

@@ -18,8 +18,8 @@ from pydantic import Field, ValidationError, model_validator
 from typing_extensions import Self
 
 from ba_torchrl import __version__
-from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import json_bytes, read_json, write_text
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.files import json_bytes, read_json, write_text
 
 RESULT_FILE = "result.json"
 CONFIG_FILE = "config.json"

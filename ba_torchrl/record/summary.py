@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
     CurvePoint,

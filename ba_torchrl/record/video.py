@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_torchrl.data.files import replaced
-from ba_torchrl.errors import ConfigError, MissingPackageError, install_command
+from ba_torchrl.core.errors import ConfigError, MissingPackageError, install_command
+from ba_torchrl.core.files import replaced
 
 if TYPE_CHECKING:
     from ba_torchrl.envs.base import BulletArmEnv

@@ -18,7 +18,7 @@ import pybullet
 import pybullet_data
 from typing_extensions import Self
 
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.sim.articulated import ArticulatedBody, PrismaticJoint
 from ba_torchrl.sim.bodies import Body, set_asleep
 from ba_torchrl.sim.shapes import Color, Shape

@@ -13,10 +13,10 @@ from typing import Any, ClassVar, Literal, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand, PickPlaceCommand
-from ba_torchrl.config import TaskParameters
-from ba_torchrl.errors import ConfigError, PlacementError
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.actions import GripperCommand, PickPlaceCommand
+from ba_torchrl.core.config import TaskParameters
+from ba_torchrl.core.errors import ConfigError, PlacementError
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Matrix, YawPose
 from ba_torchrl.sim.robots.base import Robot

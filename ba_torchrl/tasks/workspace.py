@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.geometry import PlanarFrame, Vector
 
 LAYOUT_ATTEMPTS = 2000

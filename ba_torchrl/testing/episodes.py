@@ -10,7 +10,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from ba_torchrl import make
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.tasks.base import TASKS, Task
 

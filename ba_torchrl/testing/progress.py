@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from tensordict import TensorDictBase
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.bodies import Body, vertical_extent

@@ -20,7 +20,7 @@ from tensordict import TensorDictBase
 from torchrl.envs.utils import check_env_specs
 
 from ba_torchrl import make, make_vector_env
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.testing.episodes import (

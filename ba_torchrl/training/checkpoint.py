@@ -12,11 +12,11 @@ from torchrl.checkpoint import CheckpointError, CheckpointRotation
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner, Problem
-from ba_torchrl.config import Which
-from ba_torchrl.data.files import read_json, write_text
+from ba_torchrl.core.config import Which
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import read_json, write_text
+from ba_torchrl.core.plugins import check_known
 from ba_torchrl.envs.factory import make
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE
 from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.config import ExperimentConfig

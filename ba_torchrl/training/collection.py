@@ -13,12 +13,12 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import Learner, SeedUse
-from ba_torchrl.data.demo_files import load_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations, source_config
-from ba_torchrl.data.episodes import is_success
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import load_plugins
+from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
+from ba_torchrl.demonstrations.demo_files import load_demonstrations
+from ba_torchrl.demonstrations.episodes import is_success
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import load_plugins
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import Field
 
-from ba_torchrl.config import MAX_SEED, CompileMode, Source, WorkerOptions, changed, parse
+from ba_torchrl.core.config import MAX_SEED, CompileMode, Source, WorkerOptions, changed, parse
+from ba_torchrl.core.errors import ConfigError, install_command
+from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
-from ba_torchrl.errors import ConfigError, install_command
-from ba_torchrl.plugins import MAIN, load_plugins
 from ba_torchrl.record.logging import is_available
 from ba_torchrl.tasks.structures.base import check_has_structure
 
@@ -314,8 +314,8 @@ class ExperimentConfig(WorkerOptions):
             )
 
     def _check_demonstrations(self) -> None:
-        from ba_torchrl.data.demo_files import check_demonstrations
-        from ba_torchrl.data.demos import check_noise, check_turn_noise
+        from ba_torchrl.demonstrations.collect import check_noise, check_turn_noise
+        from ba_torchrl.demonstrations.demo_files import check_demonstrations
 
         check_noise(self.demonstrations_noise, self.demonstrations_source, "demonstrations_noise")
         check_turn_noise(

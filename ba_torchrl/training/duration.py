@@ -10,7 +10,7 @@ from typing import get_args
 import torch
 
 from ba_torchrl.algorithms.base import network_dtype
-from ba_torchrl.hardware import processor
+from ba_torchrl.core.hardware import processor
 from ba_torchrl.record.results import Phase
 from ba_torchrl.training.config import ExperimentConfig
 

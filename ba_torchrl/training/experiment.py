@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from typing_extensions import Self
 
 from ba_torchrl.algorithms.base import SeedUse
-from ba_torchrl.data.episodes import mean_length, success_rate
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.demonstrations.episodes import mean_length, success_rate
 from ba_torchrl.record.logging import ScalarLog, progress_bar
 from ba_torchrl.record.results import CurvePoint, TestedPolicy
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm

@@ -20,19 +20,19 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner, SeedUse, derive_seed
-from ba_torchrl.data.demo_files import (
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import complete_only
+from ba_torchrl.demonstrations.collect import RandomActions, expert_policy
+from ba_torchrl.demonstrations.demo_files import (
     check_demonstrations,
     load_demonstrations,
     read_metadata,
     save_demonstrations,
 )
-from ba_torchrl.data.demos import RandomActions, expert_policy
-from ba_torchrl.data.episodes import Policy, collect_episodes, quotas
-from ba_torchrl.data.files import complete_only
-from ba_torchrl.envs import keys
+from ba_torchrl.demonstrations.episodes import Policy, collect_episodes, quotas
 from ba_torchrl.envs.factory import make_vector_env
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig

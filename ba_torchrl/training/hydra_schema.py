@@ -22,10 +22,10 @@ from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from ba_torchrl.config import EnvConfig
-from ba_torchrl.errors import ConfigError, known_names
-from ba_torchrl.plugins import load_plugins
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.plugins import load_plugins
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
 from ba_torchrl.training.grid.plan import SET_BY_THE_GRID, BenchmarkConfig
 

@@ -11,8 +11,8 @@ from types import FrameType
 from torchrl.envs import EnvBase
 from typing_extensions import Self
 
+from ba_torchrl.core.errors import SimulationError, WorkerError
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.errors import SimulationError, WorkerError
 
 logger = logging.getLogger(__name__)
 

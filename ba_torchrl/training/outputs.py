@@ -7,10 +7,10 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from ba_torchrl.algorithms.base import Learner
-from ba_torchrl.data.demo_files import recorded_expert
-from ba_torchrl.data.episodes import Policy
-from ba_torchrl.errors import MissingPackageError, install_command
-from ba_torchrl.hardware import hardware
+from ba_torchrl.core.errors import MissingPackageError, install_command
+from ba_torchrl.core.hardware import hardware
+from ba_torchrl.demonstrations.demo_files import recorded_expert
+from ba_torchrl.demonstrations.episodes import Policy
 from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
     CurvePoint,

@@ -18,7 +18,8 @@ from torchrl.checkpoint import (
     CheckpointLoadResult,
 )
 
-from ba_torchrl.data.files import (
+from ba_torchrl.core.errors import ConfigError, DamagedFilesError
+from ba_torchrl.core.files import (
     OLD,
     RENAMED,
     Lock,
@@ -28,7 +29,6 @@ from ba_torchrl.data.files import (
     seal,
     write_state,
 )
-from ba_torchrl.errors import ConfigError, DamagedFilesError
 
 logger = logging.getLogger(__name__)
 

@@ -26,14 +26,14 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
-from ba_torchrl.config import StrictModel, explain
-from ba_torchrl.data.files import complete_only, json_bytes, write_tensors, write_text
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import StrictModel, explain
+from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
+from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError, known_names
-from ba_torchrl.hardware import hardware
 from ba_torchrl.record.results import (
     RESULT_FILE,
     RunResult,
@@ -184,7 +184,8 @@ class TrainedPolicy(TensorDictModuleBase):
         """Make the environment that the policy was trained in.
 
         Args:
-            changes: fields of `ba_torchrl.config.EnvConfig` with other values, such as ``seed=0``.
+            changes: fields of `ba_torchrl.core.config.EnvConfig` with other values, such as
+                ``seed=0``.
 
         Raises:
             ConfigError: as `ba_torchrl.make`.

@@ -15,8 +15,8 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.config import FIRST_TEST_SEED
-from ba_torchrl.data.episodes import Policy, is_success, play_seeds
+from ba_torchrl.core.config import FIRST_TEST_SEED
+from ba_torchrl.demonstrations.episodes import Policy, is_success, play_seeds
 from ba_torchrl.record.results import TestedPolicy
 
 PROTOCOL = 1

@@ -6,7 +6,7 @@ import importlib
 from importlib.util import find_spec
 from types import ModuleType
 
-from ba_torchrl.errors import ConfigError, install_command
+from ba_torchrl.core.errors import ConfigError, install_command
 
 
 def check_installed(option: str) -> None:

@@ -21,8 +21,8 @@ from typing import Any
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
 from ba_torchrl.algorithms.base import Learner
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, Phase, differences
 from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.checkpoint import read_config, read_versions, write_config

@@ -18,7 +18,7 @@ from tensordict import TensorDictBase
 from torch import Tensor, nn
 from torchrl.objectives.sac import compute_rsample_log_prob
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.equivariant import ActionFields
 from ba_torchrl.modules.actor_critic.gaussian_policy import UnitTanhNormal
 from ba_torchrl.modules.actor_critic.trunk import scale_from_log_std, trunk_stages

@@ -16,12 +16,12 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner, network_dtype
-from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.core import keys
+from ba_torchrl.core.hardware import amx_is_used
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.envs import keys
-from ba_torchrl.hardware import amx_is_used
+from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on

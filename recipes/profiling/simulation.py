@@ -11,7 +11,7 @@ import pybullet
 from torch import Tensor
 
 from ba_torchrl import list_tasks, make
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box

@@ -11,10 +11,10 @@ import torch
 from pydantic import ValidationError
 
 from ba_torchrl.algorithms.compilation import CompileMode
-from ba_torchrl.config import StrictModel
-from ba_torchrl.data.files import json_bytes, write_text
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.hardware import hardware, onednn_max_cpu_isa
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import json_bytes, write_text
+from ba_torchrl.core.hardware import hardware, onednn_max_cpu_isa
 from ba_torchrl.modules.layers import Precision
 from ba_torchrl.record.results import now, versions
 from profiling.table import Row

@@ -14,10 +14,10 @@ from pydantic.dataclasses import dataclass as validated
 from tqdm import tqdm
 
 from ba_torchrl.algorithms.compilation import CompileMode
-from ba_torchrl.config import StrictModel
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.modules.layers import Precision
-from ba_torchrl.registry import Registry
 
 GROUPS = ("simulation", "learning", "throughput", "memory")
 

@@ -13,7 +13,7 @@ from typing import Any
 
 from torchrl.collectors import Collector
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.training.checkpoint import build_algorithm

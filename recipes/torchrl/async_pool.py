@@ -15,8 +15,9 @@ from tensordict import TensorDict
 from torchrl.envs import AsyncEnvPool
 
 import ba_torchrl
-from ba_torchrl.data import as_transitions, expert_policy, make_codecs, make_replay, success_rate
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.data import as_transitions, make_codecs, make_replay
+from ba_torchrl.demonstrations import expert_policy, success_rate
 
 
 def main(

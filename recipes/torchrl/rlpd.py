@@ -17,8 +17,9 @@ from torchrl.data import LazyTensorStorage, OfflineToOnlineReplayBuffer, ReplayB
 from torchrl.objectives import REDQLoss, SoftUpdate
 
 import ba_torchrl
-from ba_torchrl.data import as_transitions, collect_demonstrations
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.data import as_transitions
+from ba_torchrl.demonstrations import collect_demonstrations
 from ba_torchrl.modules import (
     ActionValue,
     ActorCriticSpec,

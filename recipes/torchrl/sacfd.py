@@ -21,15 +21,9 @@ from torchrl.objectives import SoftUpdate
 from torchrl.trainers.algorithms import SACTrainer
 
 import ba_torchrl
-from ba_torchrl.data import (
-    ImageCodecs,
-    SO2Augmentation,
-    as_transitions,
-    collect_demonstrations,
-    make_codecs,
-    make_replay,
-)
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.data import ImageCodecs, SO2Augmentation, as_transitions, make_codecs, make_replay
+from ba_torchrl.demonstrations import collect_demonstrations
 from ba_torchrl.modules import ActorCriticSpec, EquivariantConfig, squashed_gaussian_policy
 from ba_torchrl.objectives import SACfDLoss
 

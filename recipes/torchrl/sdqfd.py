@@ -16,13 +16,8 @@ from torchrl.envs import TransformedEnv
 from torchrl.objectives import HardUpdate
 
 import ba_torchrl
-from ba_torchrl.data import (
-    ImageCodecs,
-    as_transitions,
-    collect_demonstrations,
-    make_codecs,
-    make_replay,
-)
+from ba_torchrl.data import ImageCodecs, as_transitions, make_codecs, make_replay
+from ba_torchrl.demonstrations import collect_demonstrations
 from ba_torchrl.modules import (
     EquiASRConfig,
     SpatialActions,

@@ -10,8 +10,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 from torchrl.modules import recurrent_mode, set_recurrent_mode
 
 from ba_torchrl.algorithms.compilation import CompiledLoss, check_compiler
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.checkpoint import read_config
 from tests.algorithms import tiny
 from tests.algorithms.tiny import FERM, SIX_DOF, make_experiment, run, transitions

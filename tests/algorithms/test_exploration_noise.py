@@ -7,8 +7,8 @@ from torchrl.envs.utils import ExplorationType, exploration_type, set_exploratio
 
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.algorithms.sac import SAC
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from tests.algorithms.tiny import OPEN, build, make_experiment, transitions
 from tests.training.collectors.runs import config_for, start
 

@@ -5,7 +5,7 @@ import torch
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from ba_torchrl.algorithms.host_tasks import HostTasks
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from tests.algorithms.tiny import FERM, SIX_DOF, build, network_config, transitions
 
 CPU = torch.device("cpu")

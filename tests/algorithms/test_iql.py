@@ -4,7 +4,7 @@ import pytest
 import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.record.logging import read_scalars
 from tests.algorithms.tiny import build, run, transitions
 

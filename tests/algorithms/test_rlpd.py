@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ba_torchrl.algorithms.base import ALGORITHMS
-from ba_torchrl.config import parse
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from tests.algorithms.tiny import build, problem, run, transitions
 

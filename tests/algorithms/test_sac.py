@@ -4,10 +4,10 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
-from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
 
 TASK = "close_loop/block_reaching"

@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from tests.algorithms.tiny import build, make_experiment, transitions
 
 

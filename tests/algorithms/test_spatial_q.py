@@ -11,10 +11,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import ba_torchrl
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.spatial_q import SpatialQConfig
-from ba_torchrl.config import parse
-from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
 from tests.algorithms.tiny import SIX_DOF
 

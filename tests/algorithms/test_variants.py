@@ -13,11 +13,11 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.algorithms.sac import SAC
-from ba_torchrl.config import parse
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
 from ba_torchrl.data.augmentation.views import RandomViews
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.objectives.sacfd import SoftUpdateByNetwork
 from ba_torchrl.training import hydra_schema
 from tests.algorithms import tiny

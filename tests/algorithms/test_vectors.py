@@ -6,10 +6,10 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.demonstrations.collect import collect_demonstrations
+from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from tests.algorithms import tiny
 
 SIZES = {"proprio": 8, "joints": 7}

@@ -7,11 +7,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, exploration_type, set_exploration_type
 
+from ba_torchrl.core import keys
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
-from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import read_scalars
 from tests.algorithms import tiny
 from tests.algorithms.tiny import make_experiment, transitions

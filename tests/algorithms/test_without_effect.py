@@ -5,7 +5,7 @@ import logging
 import pytest
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.config import parse
+from ba_torchrl.core.config import parse
 from tests.algorithms.tiny import make_experiment
 
 COPIES = {"augmentation": "so2", "stored_copies": 2}

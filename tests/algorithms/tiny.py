@@ -3,11 +3,11 @@
 import torch
 from tensordict import TensorDict
 
-from ba_torchrl.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS, Problem
-from ba_torchrl.config import parse
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
+from ba_torchrl.core.config import parse
 from ba_torchrl.data.transitions import WITH_TARGET
-from ba_torchrl.envs import keys
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from tests.specs import close_loop_images, open_loop_images

@@ -16,9 +16,9 @@ import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE, types
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.cli.types import check_writable_file
-from ba_torchrl.config import StrictModel, parse
-from ba_torchrl.data.files import complete_only
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import StrictModel, parse
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import complete_only
 from ba_torchrl.training.config import ExperimentConfig
 from tests.recipes import load_recipe, recipe
 

@@ -5,11 +5,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.transfer import batch_to_device, to_device
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
 
 CPU, META = torch.device("cpu"), torch.device("meta")
 IMAGES = {

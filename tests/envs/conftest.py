@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.envs.vector.parallel import VectorEnv
 

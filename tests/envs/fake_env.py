@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
-from ba_torchrl.errors import ConfigError, SimulationError
+from ba_torchrl.core.errors import ConfigError, SimulationError
 
 FLAGS = ("done", "terminated", "truncated")
 

@@ -13,10 +13,10 @@ from torchrl.envs import EnvBase, ParallelEnv, check_env_specs
 
 import ba_torchrl
 from ba_torchrl import BulletArmEnv
-from ba_torchrl.data.time_reversal import make_deconstruction_env
+from ba_torchrl.core.errors import ConfigError, InvalidActionError, SimulationError
+from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import faults
 from ba_torchrl.envs.checks import checked_action
-from ba_torchrl.errors import ConfigError, InvalidActionError, SimulationError
 from ba_torchrl.tasks.base import TASKS
 
 TASK = "close_loop/block_picking"

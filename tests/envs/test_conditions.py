@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
 from tests.specs import slow_except
 

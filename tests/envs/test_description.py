@@ -5,9 +5,9 @@ import typing
 import pytest
 
 import ba_torchrl
-from ba_torchrl.config import EnvConfig, EnvKeywords
+from ba_torchrl.core.config import EnvConfig, EnvKeywords
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs import description
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS, versions_of
 
 

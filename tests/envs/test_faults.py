@@ -8,8 +8,8 @@ import pytest
 import torch
 
 import ba_torchrl
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.envs import faults
-from ba_torchrl.errors import SimulationError
 from ba_torchrl.sim.world import World
 from ba_torchrl.testing.episodes import image_of
 

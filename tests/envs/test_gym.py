@@ -12,9 +12,9 @@ from gymnasium.utils.passive_env_checker import env_render_passive_checker
 from torchrl.data import Categorical
 
 import ba_torchrl
+from ba_torchrl.core.errors import ConfigError, InvalidActionError, SimulationError
 from ba_torchrl.envs import gym
 from ba_torchrl.envs.registration import gym_id
-from ba_torchrl.errors import ConfigError, InvalidActionError, SimulationError
 from ba_torchrl.tasks.base import TASKS as REGISTRY
 from tests.specs import slow_except
 

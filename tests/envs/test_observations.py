@@ -12,9 +12,9 @@ from torchrl.envs import ParallelEnv
 from torchrl.envs.utils import check_env_specs
 
 import ba_torchrl
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.gym import GymEnv
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix
 from ba_torchrl.tasks.instructions import color_name
 from tests.tasks.episodes import follow_expert

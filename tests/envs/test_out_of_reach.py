@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 
 HORIZONTAL = [0.0, 0.45, 0.0, 0.02, 0.0, 0.0, math.pi / 2]
 VERTICAL = [0.0, 0.45, 0.0, 0.02, 0.0, 0.0, 0.0]

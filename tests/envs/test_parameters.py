@@ -9,10 +9,10 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.config import CUSTOM_PHYSICS, EnvConfig
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import CUSTOM_PHYSICS, EnvConfig
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.views import VIEWS
 from ba_torchrl.tasks.base import TASKS

@@ -3,8 +3,8 @@
 import pytest
 
 import ba_torchrl
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.envs.episodes import MAX_REFUSED
-from ba_torchrl.errors import PlacementError
 
 
 def refuse(env, monkeypatch, count):

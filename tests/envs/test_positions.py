@@ -7,7 +7,7 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core.errors import SimulationError
 
 CASES = {
     "close_loop/block_picking": {"obs_size": 32},

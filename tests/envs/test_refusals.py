@@ -5,8 +5,8 @@ import math
 import pytest
 
 import ba_torchrl
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS
 
 PICKING = "close_loop/block_picking"

@@ -10,7 +10,8 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.envs import base, keys
+from ba_torchrl.core import keys
+from ba_torchrl.envs import base
 from ba_torchrl.envs.rendering import ARM_VIEW, scene_viewpoint
 from ba_torchrl.record.video import FrameRecorder
 from ba_torchrl.sim.geometry import downward

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.data.time_reversal import make_deconstruction_env
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS, Task
 from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
 from ba_torchrl.training.config import ExperimentConfig

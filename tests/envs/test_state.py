@@ -13,10 +13,10 @@ import torch
 from torchrl.envs import ParallelEnv, RewardSum, SerialEnv, StepCounter, TransformedEnv
 
 import ba_torchrl
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
+from ba_torchrl.core.errors import ConfigError, SimulationError
 from ba_torchrl.envs.vector.batching import Vector
 from ba_torchrl.envs.vector.make import make_vector
-from ba_torchrl.errors import ConfigError, SimulationError
 from ba_torchrl.testing.episodes import image_of
 from tests.specs import slow_except
 

@@ -13,9 +13,9 @@ from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
 
 import ba_torchrl
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data import CenterCrop, ImageCodecs, RandomViews
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 
 TASKS = {"close_loop/block_reaching": {}, "open_loop/block_stacking": {"num_objects": 2}}
 

@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from ba_torchrl.core import keys
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
-from ba_torchrl.envs import keys
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import load, problem_of
 from ba_torchrl.training.config import ExperimentConfig

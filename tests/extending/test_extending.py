@@ -13,10 +13,10 @@ import torch
 
 import ba_torchrl
 from ba_torchrl import testing
-from ba_torchrl.data.demos import expert_scores
-from ba_torchrl.data.time_reversal import make_deconstruction_env
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.demonstrations.collect import expert_scores
+from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching

@@ -11,10 +11,10 @@ from hypothesis import strategies as st
 
 import ba_torchrl
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.config import EnvConfig
+from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.errors import ConfigError, InvalidActionError
 from ba_torchrl.envs.checks import check_actions, checked_action
 from ba_torchrl.envs.settings import resolve_env
-from ba_torchrl.errors import ConfigError, InvalidActionError
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
 from tests.fuzz.values import JSON, PLUGINS, changed, check, examples

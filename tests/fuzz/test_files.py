@@ -10,10 +10,10 @@ import torch
 from hypothesis import strategies as st
 
 import ba_torchrl
-from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.files import CHECKSUMS_FILE, read_state, seal, write_state
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import CHECKSUMS_FILE, read_state, seal, write_state
+from ba_torchrl.demonstrations.collect import collect_demonstrations
+from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, load, write_config

@@ -4,8 +4,8 @@ import pytest
 from hypothesis import strategies as st
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.config import EnvConfig
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import BenchmarkConfig
 from tests.fuzz.values import JSON, changed, check, examples

@@ -8,7 +8,7 @@ import torch
 
 pytest.importorskip("escnn")
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from tests.modules.networks import actor_critic
 
 

@@ -183,7 +183,7 @@ def test_missing_escnn_names_the_fix():
     code = """
 import sys
 sys.modules["escnn"] = None
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.core.errors import MissingPackageError
 from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from tests.specs import actor_critic_spec, spatial_spec

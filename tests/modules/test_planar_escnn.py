@@ -14,7 +14,7 @@ for name in ("lie_learn", "py3nj"):
 import warnings
 warnings.simplefilter("error")
 BEFORE
-from ba_torchrl.errors import MissingPackageError
+from ba_torchrl.core.errors import MissingPackageError
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 gspaces = import_escnn("escnn.gspaces")
 assert gspaces.rot2dOnR2(8).fibergroup.order() == 8

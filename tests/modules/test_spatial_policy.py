@@ -7,7 +7,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.core.actions import OpenLoopActions
 from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
 from ba_torchrl.modules.spatial.policy import (
     SpatialActions,

@@ -11,7 +11,7 @@ from torch import nn
 from torchrl.modules import QValueActor
 from torchrl.objectives import DQNLoss
 
-from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.core.actions import OpenLoopActions
 from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
 from ba_torchrl.objectives.dqn import LevelDQNLoss, large_margin, strict_large_margin

@@ -7,7 +7,7 @@ from torch import nn
 from torch.distributions import Bernoulli, kl_divergence
 from torchrl.modules import TanhNormal
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.objectives.imitation import (
     BehaviourCloningLoss,

@@ -11,7 +11,7 @@ from torch import nn
 from torch.distributions import Bernoulli, kl_divergence
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.objectives.rlpd import RLPDLoss
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SoftUpdateByNetwork
 from tests.linear_sac import batch, make

@@ -7,7 +7,7 @@ from torch import nn
 
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.algorithms.sac import SACConfig
-from ba_torchrl.config import StrictModel
+from ba_torchrl.core.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic
 
 

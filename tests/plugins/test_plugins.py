@@ -14,8 +14,8 @@ from types import ModuleType
 import pytest
 
 from ba_torchrl import make_vector_env
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import import_modules
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import import_modules
 from tests.fresh import run_script
 
 ROOT = Path(__file__).parents[2]
@@ -162,7 +162,7 @@ def play(**options):
 
 def test_a_task_of_a_notebook_is_refused_in_spawned_workers(folder):
     code = f"""{IN_MAIN}
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 message = ""
 try:
     play()

@@ -7,7 +7,7 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from tqdm import tqdm
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
 from ba_torchrl.objectives.sacfd import SACfDLoss

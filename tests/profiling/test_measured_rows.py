@@ -7,7 +7,7 @@ import torch
 import torch.nn.functional as F
 from tqdm import tqdm
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from profiling import layers, learning, limits, throughput
 from profiling.limits import MatrixProduct, count_multiply_adds
 from profiling.table import COLUMNS, Bench, Budget, Row, as_markdown

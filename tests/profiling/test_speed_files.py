@@ -9,7 +9,7 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from profiling import speed_file
 from profiling.comparison import changes, columns_of_changes, ratio_of_medians
 from profiling.speed_file import (

@@ -5,8 +5,8 @@ import torch
 from tqdm import tqdm
 
 import ba_torchrl
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.base import BulletArmEnv
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.sim.vision import depth
 from profiling import simulation, throughput
 from profiling.table import (

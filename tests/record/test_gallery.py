@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl import make
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.record import gallery
 from ba_torchrl.record.gallery import Strip, expert_strip, overview_figure, strip_figure
 from ba_torchrl.record.task_page import tasks_by_heading

@@ -6,7 +6,7 @@ import pytest
 
 from ba_torchrl import list_tasks
 from ba_torchrl.commands import leaderboard as command
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record import leaderboard as boards
 from ba_torchrl.record.leaderboard import leaderboard
 from ba_torchrl.record.results import read_result

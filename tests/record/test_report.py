@@ -13,7 +13,7 @@ import pytest
 
 from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import report
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import (

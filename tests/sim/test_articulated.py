@@ -4,7 +4,7 @@ import numpy as np
 import pybullet
 import pytest
 
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.sim.articulated import PrismaticJoint
 from ba_torchrl.sim.meshes import box_mesh, rod_mesh, transform_mesh
 from ba_torchrl.sim.robots.kuka import Kuka

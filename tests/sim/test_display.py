@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.sim import world as display
 from ba_torchrl.sim.world import World, why_no_display
 

@@ -1,7 +1,7 @@
 import pybullet
 import pytest
 
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.sim.world import loading
 
 

@@ -6,7 +6,7 @@ import pybullet
 import pytest
 
 import ba_torchrl
-from ba_torchrl.errors import SimulationError
+from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 

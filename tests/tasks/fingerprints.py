@@ -28,7 +28,7 @@ import torch
 from tensordict import TensorDictBase
 
 import ba_torchrl
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, versions_of

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.sim.contacts import contacts, vertical_force_n
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.kuka import Kuka

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ba_torchrl.data.demos import expert_scores
+from ba_torchrl.demonstrations.collect import expert_scores
 from ba_torchrl.sim.robots import ur5
 from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
 

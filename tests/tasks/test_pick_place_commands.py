@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from ba_torchrl.actions import PICK, PLACE, OpenLoopActions
+from ba_torchrl.core.actions import PICK, PLACE, OpenLoopActions
 from ba_torchrl.sim.geometry import Pose, downward_pose
 from ba_torchrl.tasks.manipulation.commands import (
     LEVEL_RAD,

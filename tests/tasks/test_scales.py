@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import ba_torchrl
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS, check_scales
 from tests.tasks.episodes import slow_variants
 

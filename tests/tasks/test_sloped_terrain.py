@@ -8,7 +8,7 @@ import pytest
 from scipy.optimize import linprog
 
 import ba_torchrl
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.bodies import world_vertices
 from ba_torchrl.sim.geometry import quaternion_matrix, tool_rotation
 from ba_torchrl.sim.robots.kuka import Kuka

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.tasks.workspace import Area, OrientedArea
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.agreement import agreement_table, agreements, check_comparable
 
 OURS = torch.tensor([[1.0, 0.0, 0.5], [1.0, 1.0, -0.5], [1.0, 2.0, 0.5]])

@@ -12,10 +12,10 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.data.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.files import CHECKSUMS_FILE, fingerprint, seal
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import CHECKSUMS_FILE, fingerprint, seal
+from ba_torchrl.demonstrations.collect import collect_demonstrations
+from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_failure, read_result
 from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config

@@ -3,7 +3,7 @@ import time
 import pytest
 import torch
 
-from ba_torchrl import hardware
+from ba_torchrl.core import hardware
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training import duration
 from ba_torchrl.training.config import ExperimentConfig

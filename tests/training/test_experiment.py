@@ -13,10 +13,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import SeedUse
-from ba_torchrl.data.demo_files import save_demonstrations
-from ba_torchrl.data.demos import collect_demonstrations
-from ba_torchrl.data.exchange import export_demonstrations
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.demonstrations.collect import collect_demonstrations
+from ba_torchrl.demonstrations.demo_files import save_demonstrations
+from ba_torchrl.demonstrations.exchange import export_demonstrations
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import Phase, TestedPolicy, read_result
 from ba_torchrl.tasks.base import TASKS

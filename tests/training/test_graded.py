@@ -6,17 +6,17 @@ from types import SimpleNamespace
 
 import pytest
 import torch
+from tests.data.test_formats import assert_equal
 
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.commands import collect
-from ba_torchrl.data import load_demonstrations
-from ba_torchrl.data.demo_files import read_metadata
-from ba_torchrl.data.files import complete_only
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import complete_only
+from ba_torchrl.demonstrations import load_demonstrations
+from ba_torchrl.demonstrations.demo_files import read_metadata
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import graded
 from ba_torchrl.training.graded import GRADES, GradedSets
-from tests.data.test_formats import assert_equal
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 

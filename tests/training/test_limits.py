@@ -11,7 +11,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.cli.errors import plain_errors
-from ba_torchrl.data.files import complete_only, write_tensors, write_text
+from ba_torchrl.core.files import complete_only, write_tensors, write_text
 from ba_torchrl.record.gallery import Strip, strip_figure
 from ba_torchrl.record.plots import Learning, plot_learning_curve, plot_panels
 from ba_torchrl.record.video import write_video

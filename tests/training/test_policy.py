@@ -15,7 +15,7 @@ from torchrl.envs import StepCounter, TransformedEnv
 
 import ba_torchrl
 from ba_torchrl.commands import evaluate
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import RunResult, TestedPolicy, read_result
 from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS

@@ -6,9 +6,9 @@ import torch
 
 from ba_torchrl import make, make_vector_env
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
-from ba_torchrl.config import FIRST_TEST_SEED, MAX_ENVS, MAX_SEED
-from ba_torchrl.data import episodes as played
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import FIRST_TEST_SEED, MAX_ENVS, MAX_SEED
+from ba_torchrl.demonstrations import episodes as played
 from ba_torchrl.envs.vector.batching import SerialVectorEnv
 from ba_torchrl.training import protocol
 

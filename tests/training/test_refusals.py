@@ -7,7 +7,7 @@ import pytest
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
 from ba_torchrl.cli import EXIT_CODE
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from tests.cli.test_commands import RUN
 from tests.recipes import recipe
 from tests.training.test_experiment import TINY, tiny

@@ -5,7 +5,7 @@ import pytest
 import torch
 from torchrl.checkpoint import GlobalRNGState
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.tasks.base import TASKS

@@ -11,7 +11,9 @@ import torch.nn.functional as F
 from tensordict import TensorDictBase
 from torch import Tensor
 
-from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import OpenLoopActions
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import (
     SeededTransform,
     copy_exact_quarters,
@@ -21,8 +23,6 @@ from ba_torchrl.data.augmentation.so2 import (
     require_known_frames,
 )
 from ba_torchrl.data.transfer import to_device
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
 
 RigidTransforms = Literal["none", "translation", "cn", "d4", "se2"]
 """Translations; rotations of C_n; quarter turns and reflections; rotations and translations."""

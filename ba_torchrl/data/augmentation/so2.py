@@ -13,11 +13,11 @@ from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.envs import Transform
 
-from ba_torchrl._generators import seeded_generator
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.generators import seeded_generator
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.transfer import to_device
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.errors import ConfigError
 
 
 def quarters_and_rotation(angle_rad: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -13,12 +13,12 @@ from torch import Tensor
 from torchrl.data import Composite
 from torchrl.envs import Transform
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import SeededTransform, image_pairs
 from ba_torchrl.data.replay.codecs import mapped_bounds
 from ba_torchrl.data.transfer import to_device
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.errors import ConfigError
 
 ViewTransform = Literal["none", "crop", "shift"]
 """Random views of an image: parts of it, or the image moved by some pixels."""

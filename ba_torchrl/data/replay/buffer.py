@@ -9,11 +9,11 @@ from torch import Tensor
 from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 
-from ba_torchrl.data.files import StateFolder
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError, ReplaySchemaError
+from ba_torchrl.core.files import StateFolder
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError, ReplaySchemaError
 
 _INDEX = "index"  # TorchRL's writer adds it
 _NOT_STORED = (keys.FAULT, (keys.NEXT, keys.FAULT))

@@ -12,9 +12,9 @@ from torch import Tensor, nn
 from torchrl.data import Bounded, Composite
 from torchrl.envs import Transform
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.transfer import to_device
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
 
 
 class ImageCodec(Protocol):

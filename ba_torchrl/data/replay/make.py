@@ -7,7 +7,7 @@ from typing import Literal
 
 from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 
-from ba_torchrl._generators import seeded_generator
+from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import ImageCodec
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler

@@ -18,10 +18,10 @@ from torchrl.data.replay_buffers.samplers import (
 )
 from torchrl.data.replay_buffers.storages import Storage
 
-from ba_torchrl.data.files import StateFolder
+from ba_torchrl.core import keys
+from ba_torchrl.core.files import StateFolder
 from ba_torchrl.data.replay.segment_tree import MinTree, SumTree
 from ba_torchrl.data.replay.storage import OneProcess, stored_flags
-from ba_torchrl.envs import keys
 
 
 class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):

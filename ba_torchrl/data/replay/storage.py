@@ -16,9 +16,9 @@ from torch import Tensor
 from torchrl.data import LazyTensorStorage, TensorStorage
 from torchrl.data.replay_buffers.storages import Storage
 
-from ba_torchrl.data.files import StateFolder
+from ba_torchrl.core import keys
+from ba_torchrl.core.files import StateFolder
 from ba_torchrl.data.replay.codecs import ImageCodec
-from ba_torchrl.envs import keys
 
 _LEVEL = 1
 """Level of zlib: it compresses rendered depth fifty-fold, and higher ones gain little."""

@@ -9,10 +9,10 @@ from torch import Tensor
 from torchrl.data.replay_buffers.samplers import Sampler
 from torchrl.data.replay_buffers.storages import Storage
 
-from ba_torchrl._generators import seeded_generator
-from ba_torchrl.data.files import StateFolder
+from ba_torchrl.core import keys
+from ba_torchrl.core.files import StateFolder
+from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.data.replay.storage import OneProcess, stored_flags
-from ba_torchrl.envs import keys
 
 _SIDES = ("expert", "online")
 

@@ -8,9 +8,9 @@ from torch import Tensor
 from torchrl.data import TensorDictRoundRobinWriter
 from torchrl.data.replay_buffers.storages import Storage
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.replay.storage import stored_flags
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 
 
 class ExpertKeepingWriter(TensorDictRoundRobinWriter):

@@ -8,10 +8,10 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
-from ba_torchrl.config import MAX_ENVS, WorkerOptions
+from ba_torchrl.core.config import MAX_ENVS, WorkerOptions
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector.batching import MakeEnv, SerialVectorEnv, Vector
 from ba_torchrl.envs.vector.parallel import VectorEnv
-from ba_torchrl.errors import ConfigError
 
 _SHARED_MEMORY = Path("/dev/shm")
 

@@ -14,12 +14,12 @@ from torchrl.data import Composite, NonTensor
 from torchrl.data.utils import CloudpickleWrapper
 from torchrl.envs import EnvCreator
 
-from ba_torchrl.config import WorkerOptions
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import WorkerOptions
+from ba_torchrl.core.errors import ConfigError, WorkerError
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.envs.vector.batching import MakeEnv, Vector
 from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
-from ba_torchrl.errors import ConfigError, WorkerError
 
 logger = logging.getLogger(__name__)
 

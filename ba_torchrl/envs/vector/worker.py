@@ -24,9 +24,9 @@ from torch import multiprocessing as mp
 from torchrl.data import NonTensor
 from typing_extensions import Self
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
+from ba_torchrl.core.errors import ConfigError, WorkerError
 from ba_torchrl.envs.vector.batching import MakeEnv
-from ba_torchrl.errors import ConfigError, WorkerError
 from ba_torchrl.sim.world import SIMULATOR_ERRORS
 
 Slot = tuple[TensorDictBase, TensorDictBase]

@@ -9,7 +9,7 @@ from torch import Tensor, nn
 from torchrl.modules import ProbabilisticActor, TanhNormal, TruncatedNormal
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 
 
 class UnitTanhNormal(TanhNormal):

@@ -10,8 +10,8 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.config import StrictModel
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import StrictModel
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
 from ba_torchrl.modules.layers import Precision, compute_dtype
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool

@@ -14,9 +14,9 @@ from pydantic import Field
 from torch import Tensor, nn
 from typing_extensions import Self
 
-from ba_torchrl.config import StrictModel
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.base import Control
 from ba_torchrl.modules.layers import Precision, compute_dtype, scaled_width
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.asr import ASR
 from ba_torchrl.modules.spatial.base import SpatialSpec

@@ -11,9 +11,9 @@ from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
-from ba_torchrl._generators import seeded_generator
-from ba_torchrl.actions import PLACE, TILTS, GridAxis, OpenLoopActions
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import PLACE, TILTS, GridAxis, OpenLoopActions
+from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.modules.layers import widened, widest_float
 from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
 

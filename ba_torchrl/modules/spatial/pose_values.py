@@ -6,7 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,

@@ -11,7 +11,7 @@ import torch.nn.functional as F
 from pydantic import Field
 from torch import Tensor
 
-from ba_torchrl.config import StrictModel
+from ba_torchrl.core.config import StrictModel
 from ba_torchrl.modules.layers import constants
 from ba_torchrl.modules.spatial.base import Level, SpatialSpec
 from ba_torchrl.modules.spatial.projections import cell_table, project, project_upright

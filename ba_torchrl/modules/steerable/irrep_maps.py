@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ba_torchrl._jit import njit
+from ba_torchrl.core.jit import njit
 
 STRIP = 256
 """Pixels whose values are computed together, so that they stay in the first cache."""

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from ba_torchrl._jit import njit
+from ba_torchrl.core.jit import njit
 from ba_torchrl.modules.steerable.cpu_threads import (
     in_parts,
     is_plain_float32,

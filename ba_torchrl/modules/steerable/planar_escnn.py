@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl.errors import MissingPackageError, install_command
+from ba_torchrl.core.errors import MissingPackageError, install_command
 
 ESCNN_FIX = "equivariant networks need escnn: pip install --no-deps escnn==1.0.11"
 _NAMES = ("lie_learn", "representations", "SO3", "wigner_d")

@@ -9,8 +9,8 @@ from typing import ClassVar, overload
 
 import numpy as np
 
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.assets.hulls import volume_and_center
 from ba_torchrl.sim.meshes import Mesh, transform_mesh
 from ba_torchrl.sim.shapes import Color, Solid

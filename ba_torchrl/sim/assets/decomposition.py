@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets.cache import Decomposition
 from ba_torchrl.sim.assets.hulls import convex_hull, simplified_hull, volume_and_center
 from ba_torchrl.sim.meshes import Mesh, merge_meshes, polygon_triangles, read_obj, write_obj

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
 from ba_torchrl.sim.assets.cache import Decomposition, cached_parts
 from ba_torchrl.sim.assets.decomposition import (

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import NamedTuple
 
-from ba_torchrl.actions import wrap_angle
+from ba_torchrl.core.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import (
     Contact,

@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pybullet
 
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.bodies import Body, set_asleep
 from ba_torchrl.sim.contacts import CONTACT_DISTANCE_M, contacts, is_any_within, nearest_points
 from ba_torchrl.sim.geometry import (

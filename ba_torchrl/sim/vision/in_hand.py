@@ -12,7 +12,7 @@ from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.geometry import euler_matrix
 from ba_torchrl.sim.vision.kernels import project
 

@@ -15,7 +15,7 @@ import math
 
 import numpy as np
 
-from ba_torchrl._jit import njit
+from ba_torchrl.core.jit import njit
 
 TIE_TOLERANCE = 1e-9
 """Voxels. A rotated voxel centre this close to halfway between two cells belongs to the upper one,

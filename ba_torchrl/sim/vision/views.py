@@ -28,7 +28,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.geometry import Pose, YawPose, yaw_quaternion
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import (

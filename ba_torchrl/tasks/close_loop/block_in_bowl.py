@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand
+from ba_torchrl.core.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.meshes import bowl_parts, centroid
 from ba_torchrl.sim.shapes import Solid

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand
+from ba_torchrl.core.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.shapes import Box

@@ -8,8 +8,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand, wrap_angle
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.actions import GripperCommand, wrap_angle
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.articulated import PrismaticJoint
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose

@@ -8,7 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.core.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask

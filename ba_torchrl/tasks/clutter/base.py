@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from ba_torchrl.config import TaskParameters
+from ba_torchrl.core.config import TaskParameters
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose, downward

@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl._jit import njit
-from ba_torchrl.actions import wrap_angle
+from ba_torchrl.core.actions import wrap_angle
+from ba_torchrl.core.jit import njit
 from ba_torchrl.sim.assets.hulls import surface_samples
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
+from ba_torchrl.core.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Pose, tool_angles
 from ba_torchrl.sim.world import World

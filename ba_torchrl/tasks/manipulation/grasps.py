@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from ba_torchrl.actions import MAX_TILT_RAD
+from ba_torchrl.core.actions import MAX_TILT_RAD
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits, approach_point, plan_approach
 from ba_torchrl.sim.geometry import (

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.core.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m, half_gap_m, passing_height_m

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from ba_torchrl.actions import wrap_angle
+from ba_torchrl.core.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.manipulation.primitives import (

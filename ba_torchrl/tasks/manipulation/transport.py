@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ba_torchrl.actions import GripperCommand, wrap_angle
+from ba_torchrl.core.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
 from ba_torchrl.sim.geometry import Vector
 from ba_torchrl.sim.robots.base import Robot

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ba_torchrl.actions import PickPlaceCommand, wrap_angle
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh, centroid, gable_mesh, prism_mesh, rod_mesh

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Literal
 
-from ba_torchrl.config import TaskParameters
+from ba_torchrl.core.config import TaskParameters
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower

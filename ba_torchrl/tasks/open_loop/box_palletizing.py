@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl.actions import PickPlaceCommand, wrap_angle
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import Pose, Vector

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ba_torchrl.actions import PLACE, PickPlaceCommand
+from ba_torchrl.core.actions import PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import downward_pose
 from ba_torchrl.tasks.base import TASKS, OpenLoopTask

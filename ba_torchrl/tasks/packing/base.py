@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pybullet
 
-from ba_torchrl.actions import PickPlaceCommand
+from ba_torchrl.core.actions import PickPlaceCommand
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame, Vector, YawPose
 from ba_torchrl.sim.meshes import box_mesh, frame_parts, merge_meshes, transform_mesh

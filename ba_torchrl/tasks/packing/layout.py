@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 

@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from ba_torchrl.actions import GripperCommand, PickPlaceCommand
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.actions import GripperCommand, PickPlaceCommand
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.sim.shapes import Color
 from ba_torchrl.tasks.base import BLUE, GREEN, RED, TASKS, CloseLoopTask, OpenLoopTask, Task

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ba_torchrl.actions import PickPlaceCommand, wrap_angle
+from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
 from ba_torchrl.sim.geometry import (
     ORIGIN,

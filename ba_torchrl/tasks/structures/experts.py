@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from ba_torchrl.actions import GripperCommand, PickPlaceCommand, wrap_angle
+from ba_torchrl.core.actions import GripperCommand, PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix, quaternion_yaw

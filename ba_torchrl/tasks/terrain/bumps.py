@@ -8,8 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl._jit import njit
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.errors import PlacementError
+from ba_torchrl.core.jit import njit
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, quaternion_product, yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Color

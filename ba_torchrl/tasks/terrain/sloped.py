@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl._jit import njit
-from ba_torchrl.errors import PlacementError
+from ba_torchrl.core.errors import PlacementError
+from ba_torchrl.core.jit import njit
 from ba_torchrl.sim.bodies import Body, world_vertices
 from ba_torchrl.sim.geometry import (
     Matrix,

@@ -13,9 +13,9 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl.algorithms.base import Learner
-from ba_torchrl.config import StrictModel, WorkerOptions
+from ba_torchrl.core.config import StrictModel, WorkerOptions
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.envs.positions import Position
-from ba_torchrl.registry import Registry
 
 
 @dataclass(frozen=True)

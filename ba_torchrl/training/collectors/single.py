@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.envs.positions import Position
 from ba_torchrl.training.collectors.base import (
     COLLECTORS,

@@ -15,8 +15,8 @@ from torch import Tensor
 from torchrl.envs import EnvBase
 
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem, CollectorConfig
 
 VERSION = "policy_version"

@@ -20,7 +20,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
-from ba_torchrl.data.files import write_text
+from ba_torchrl.core.files import write_text
 from ba_torchrl.record.logging import FILE_INTERVAL_S, last_step
 from ba_torchrl.record.results import FAILURE_FILE, now
 from ba_torchrl.training.config import ExperimentConfig

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from ba_torchrl.config import StrictModel, parse
-from ba_torchrl.errors import ConfigError
-from ba_torchrl.plugins import load_plugins
+from ba_torchrl.core.config import StrictModel, parse
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
     RESULT_FILE,

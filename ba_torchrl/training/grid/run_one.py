@@ -4,7 +4,7 @@ Environments in processes of their own import this module again, so everything e
 where it is needed.
 """
 
-from ba_torchrl._malloc import tune_malloc
+from ba_torchrl.core.malloc import tune_malloc
 
 
 def main() -> None:

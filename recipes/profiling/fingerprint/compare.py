@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from profiling.fingerprint.cases import PARTS
 
 

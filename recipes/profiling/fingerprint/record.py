@@ -26,8 +26,8 @@ from torchrl.envs.utils import step_mdp
 from tqdm import tqdm
 
 import ba_torchrl
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.registration import gym_id
-from ba_torchrl.errors import ConfigError
 from profiling.fingerprint.cases import CONFIGS, Case
 
 VALUES = 16

@@ -5,13 +5,13 @@ import pytest
 import torch
 from tensordict import TensorDict
 
-from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.rigid import (
     RigidAugmentation,
     RigidTransform,
     transform_images,
 )
-from ba_torchrl.envs import keys
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from tests.specs import from_replay, open_loop_images
 

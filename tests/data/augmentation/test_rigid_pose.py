@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from tensordict import TensorDict
 
-from ba_torchrl.actions import OpenLoopActions
+from ba_torchrl.core.actions import OpenLoopActions
 from ba_torchrl.data.augmentation.rigid import RigidAugmentation
 from ba_torchrl.modules.spatial.base import Level
 from ba_torchrl.modules.spatial.policy import SpatialActions

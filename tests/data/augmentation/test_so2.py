@@ -8,15 +8,15 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import (
     SO2Augmentation,
     StoredCopies,
     rotate_displacement,
     rotate_images,
 )
-from ba_torchrl.envs import keys
-from ba_torchrl.envs.images import ImageSpec
-from ba_torchrl.errors import ConfigError
 from tests.specs import from_replay
 
 IMAGES = {"depth": ImageSpec(1, 32, 0.4)}

@@ -4,14 +4,14 @@ import pytest
 import torch
 from tensordict import TensorDict
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.augmentation.views import (
     CenterCrop,
     RandomViews,
     cropped_images,
     take_views,
 )
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 from tests.specs import close_loop_images, from_replay
 
 SIZE = 10

@@ -12,13 +12,13 @@ from tensordict import TensorDict
 from torchrl.checkpoint import Checkpoint
 
 import ba_torchrl
-from ba_torchrl.data.demos import collect_demonstrations
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ReplaySchemaError
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.storage import FrameTable
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ReplaySchemaError
+from ba_torchrl.demonstrations.collect import collect_demonstrations
 
 QUANTIZER = DepthQuantizer(0.32)
 

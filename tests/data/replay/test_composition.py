@@ -19,6 +19,8 @@ from torchrl.data.replay_buffers import samplers, storages, writers
 from torchrl.data.replay_buffers.sample_units import Sequence
 from torchrl.envs import GymEnv
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.make import make_replay
@@ -27,8 +29,6 @@ from ba_torchrl.data.replay.segment_tree import use_python_segment_trees
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 
 use_python_segment_trees()
 

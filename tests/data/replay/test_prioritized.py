@@ -17,10 +17,10 @@ from torchrl.data import (
 )
 from torchrl.data.replay_buffers.samplers import prioritized
 
-from ba_torchrl.data.files import read_state, write_state
+from ba_torchrl.core import keys
+from ba_torchrl.core.files import read_state, write_state
 from ba_torchrl.data.replay import segment_tree
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.envs import keys
 
 EPS = 1e-6
 segment_tree.use_python_segment_trees()

@@ -3,11 +3,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
 
 QUANTIZER = DepthQuantizer(0.4)
 

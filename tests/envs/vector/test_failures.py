@@ -10,10 +10,10 @@ import pytest
 import torch
 from fake_env import FakeEnv, act, assert_lost, assert_stepped
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.parallel import VectorEnv
-from ba_torchrl.errors import ConfigError
 
 
 class TestFailures:

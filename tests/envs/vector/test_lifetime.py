@@ -13,15 +13,15 @@ import torch
 from fake_env import act, kill
 
 import ba_torchrl
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector import parallel
-from ba_torchrl.errors import ConfigError
 
 PARENT = """
 import os, signal, sys, time
 sys.path.insert(0, {tests!r})
 from fake_env import FakeEnv
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.vector.make import make_vector
 
 if __name__ == "__main__":
@@ -35,7 +35,7 @@ THREAD = """
 import os, signal, sys, threading, time
 sys.path.insert(0, {tests!r})
 from fake_env import FakeEnv, act
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.vector.make import make_vector
 
 made = []

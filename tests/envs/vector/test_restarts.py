@@ -9,10 +9,10 @@ import pytest
 import torch
 from fake_env import FakeEnv, act, assert_lost, assert_stepped, kill
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
+from ba_torchrl.core.errors import WorkerError
 from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.parallel import VectorEnv
-from ba_torchrl.errors import WorkerError
 
 METHODS = pytest.mark.parametrize("method", ["fork", pytest.param("spawn", marks=pytest.mark.slow)])
 

@@ -19,7 +19,7 @@ import torch
 from fake_env import FakeEnv, act
 from torchrl.collectors import Collector
 
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.vector.make import make_vector
 
 SECONDS = float(os.environ.get("BA_STORM_SECONDS", "60"))

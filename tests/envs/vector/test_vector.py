@@ -13,7 +13,7 @@ from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 import ba_torchrl
-from ba_torchrl.config import WorkerOptions
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.vector.batching import SerialVectorEnv
 from ba_torchrl.envs.vector.make import available_cores, make_vector
 from ba_torchrl.envs.vector.parallel import VectorEnv

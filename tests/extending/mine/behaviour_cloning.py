@@ -8,7 +8,7 @@ from torchrl.modules import ProbabilisticActor, TanhNormal
 from torchrl.objectives import LossModule
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Learner, LearnerConfig
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.modules.base import ActorCriticSpec
 
 

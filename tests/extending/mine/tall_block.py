@@ -2,7 +2,7 @@
 
 import math
 
-from ba_torchrl.config import TaskParameters
+from ba_torchrl.core.config import TaskParameters
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.manipulation.primitives import CLOSED, grasp, move_toward

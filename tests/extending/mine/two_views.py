@@ -5,7 +5,7 @@ from typing import ClassVar
 import torch
 from torch import nn
 
-from ba_torchrl.config import StrictModel
+from ba_torchrl.core.config import StrictModel
 from ba_torchrl.modules.base import NETWORKS, ActorCritic
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import torch
 
-from ba_torchrl.envs.images import ImageSpec
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.observations import OBSERVATIONS, Observation
 from ba_torchrl.sim.vision.depth import depth_image
 from ba_torchrl.sim.vision.lens import Lens

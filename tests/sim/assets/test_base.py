@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets import hulls
 from ba_torchrl.sim.assets.base import OBJECT_SETS, load_object_set
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets import decomposition, graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.graspnet import graspable_scale

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets import graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes

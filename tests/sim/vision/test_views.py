@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 import ba_torchrl
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import UnknownNameError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import UnknownNameError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape

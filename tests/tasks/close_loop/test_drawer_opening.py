@@ -126,7 +126,7 @@ def test_layouts_open_towards_the_centre_with_the_handle_in_the_workspace(make):
 
 
 def test_a_workspace_too_small_for_the_handle_is_refused():
-    with pytest.raises(ba_torchrl.errors.ConfigError, match="handle"):
+    with pytest.raises(ba_torchrl.core.errors.ConfigError, match="handle"):
         ba_torchrl.make(TASK, workspace=((0.4, 0.5), (-0.05, 0.05), (0.01, 0.25)))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import torch
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets.household import ITEMS
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.meshes import box_mesh, write_obj

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import ba_torchrl
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World

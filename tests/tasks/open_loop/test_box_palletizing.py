@@ -6,7 +6,7 @@ import math
 import pytest
 import torch
 
-from ba_torchrl.actions import PLACE
+from ba_torchrl.core.actions import PLACE
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 from ba_torchrl.tasks.open_loop.box_palletizing import BOX_M, PALLET_M, SLOT_M, slots
 from tests.tasks.episodes import follow

@@ -9,11 +9,11 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.actions import PICK, PLACE, PickPlaceCommand
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame, downward
-from ba_torchrl.tasks.open_loop.covid_test import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
+from ba_torchrl.tasks.open_loop.covid import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
 
 TASK = "open_loop/covid_test"
 FIXED = {"random_orientation": False, "action_sequence": "pxy"}

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from ba_torchrl.actions import PICK, PLACE
+from ba_torchrl.core.actions import PICK, PLACE
 from ba_torchrl.sim.meshes import box_mesh, write_obj
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
 from tests.tasks.episodes import play

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.errors import ConfigError, PlacementError
+from ba_torchrl.core.errors import ConfigError, PlacementError
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 from ba_torchrl.tasks.open_loop.bin_packing import object_shapes

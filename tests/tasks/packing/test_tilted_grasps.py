@@ -5,8 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.actions import PICK, PickPlaceCommand
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import PICK, PickPlaceCommand
 from ba_torchrl.sim.geometry import (
     quaternion_product,
     rotation_array,

@@ -7,8 +7,8 @@ import pytest
 import torch
 
 import ba_torchrl
-from ba_torchrl.data.time_reversal import replay_scores
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.demonstrations.time_reversal import replay_scores
 from ba_torchrl.sim.bodies import vertical_extent, world_vertices
 from ba_torchrl.tasks.structures.pieces import CYLINDER
 from ba_torchrl.testing import tasks as checks

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import ba_torchrl
-from ba_torchrl.actions import PICK, PLACE, PickPlaceCommand
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import world_vertices
 from ba_torchrl.sim.geometry import (
     Pose,

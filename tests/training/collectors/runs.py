@@ -2,7 +2,7 @@
 
 import torch
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig

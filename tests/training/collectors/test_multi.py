@@ -8,10 +8,10 @@ import time
 import pytest
 import torch
 
-from ba_torchrl.envs import keys
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector.batching import SerialVectorEnv
 from ba_torchrl.envs.vector.parallel import VectorEnv
-from ba_torchrl.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
 from ba_torchrl.training.experiment import Experiment

@@ -5,8 +5,8 @@ import time
 import pytest
 import torch
 
-from ba_torchrl.envs import keys
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.experiment import Experiment
 from tests.training.collectors.runs import (
     change_weights,

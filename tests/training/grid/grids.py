@@ -1,7 +1,7 @@
 """A small grid, and presets that need no Hydra."""
 
-from ba_torchrl.config import parse
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan
 
 REACH, PICK = "close_loop/block_reaching", "close_loop/block_picking"

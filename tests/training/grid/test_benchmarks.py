@@ -9,8 +9,8 @@ from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
-from ba_torchrl.config import parse
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.grid.plan import BenchmarkConfig, plan
@@ -210,7 +210,9 @@ def test_the_benchmark_in_six_degrees_of_freedom_has_the_values_of_the_appendix_
 
 
 def test_offline_learning_reads_each_set_and_plays_no_episode(monkeypatch):
-    monkeypatch.setattr("ba_torchrl.data.demo_files.check_demonstrations", lambda *_, **__: None)
+    monkeypatch.setattr(
+        "ba_torchrl.demonstrations.demo_files.check_demonstrations", lambda *_, **__: None
+    )
     config, _, runs = shipped("offline")
     methods = {"close_loop": {"bc cnn", "iql cnn"}, "open_loop": {"bc asr", "sdqfd asr"}}
     found = {(run.task, run.label) for run in runs}

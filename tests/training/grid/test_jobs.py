@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.tasks.base import TASKS

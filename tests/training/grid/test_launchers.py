@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.config import parse
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training.grid.launchers import ray as ray_launcher
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.graded import GradedSets
 from tests.training.grid.grids import COMMON, PICK, PLACE, PRESETS, REACH, planned
 

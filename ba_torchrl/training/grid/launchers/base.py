@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ba_torchrl.config import StrictModel
-from ba_torchrl.registry import Registry
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.training.config import ExperimentConfig
 
 

@@ -13,7 +13,7 @@ from typing import Any
 from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import FAILURE_FILE
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import LOG_FILE, SAVE_S, record_failure, unfinished

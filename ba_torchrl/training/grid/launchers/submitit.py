@@ -14,7 +14,7 @@ from typing import Any, Literal
 from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl.errors import ConfigError, install_command
+from ba_torchrl.core.errors import ConfigError, install_command
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import unfinished
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid, LauncherConfig

@@ -1,0 +1,1 @@
+"""What every part of the package uses, none of it particular to a simulator or a task."""

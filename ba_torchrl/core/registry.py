@@ -1,0 +1,140 @@
+"""Registry: tasks, robots, observations, networks and algorithms register by decorator."""
+
+from __future__ import annotations
+
+import importlib
+import pkgutil
+import sys
+from collections.abc import Callable, Iterator
+from typing import Generic, TypeVar
+
+from ba_torchrl.core.errors import ConfigError, UnknownNameError, known_names
+from ba_torchrl.core.plugins import load_entry_points
+
+T = TypeVar("T")
+
+PACKAGE = __name__.partition(".")[0]
+
+_LISTENERS: dict[str, list[Callable[[str], None]]] = {}
+"""By kind of entry, functions that are called with the name of each new entry."""
+
+
+def call_on_registration(kind: str, listener: Callable[[str], None]) -> None:
+    """Call a function with the name of every entry that registers from now on.
+
+    Args:
+        kind: of the entries, as given to `Registry`.
+        listener: gets the name, after the registry holds the entry.
+    """
+    _LISTENERS.setdefault(kind, []).append(listener)
+
+
+class Registry(Generic[T]):
+    """Maps names to objects that register themselves when their module is imported.
+
+    The first look-up imports every module of ``package`` and the plugins that installed packages
+    declare (`ba_torchrl.core.plugins`). A module elsewhere adds its entries when it is imported.
+
+    Args:
+        kind: what the entries are, in the singular, for error messages ("task").
+        package: dotted name of the package whose modules hold the built-in entries.
+    """
+
+    def __init__(self, kind: str, package: str) -> None:
+        self.kind = kind
+        self.package = package
+        self._entries: dict[str, T] = {}
+        self._modules: dict[str, str] = {}
+        self._is_scanned = False
+
+    def register(self, name: str) -> Callable[[T], T]:
+        """Return a decorator that registers its argument under ``name``.
+
+        A class may be defined again by its own module, as in a notebook whose cell runs twice; the
+        new definition replaces the old one.
+
+        Raises:
+            ConfigError: another object already has that name.
+        """
+        module = sys._getframe(1).f_globals.get("__name__", "__main__")
+
+        def decorate(entry: T) -> T:
+            known = self._entries.get(name, entry)
+            if known is not entry and not _is_redefinition(known, entry):
+                modules = {self._modules[name], module}
+                foreign = sorted(each for each in modules if each.partition(".")[0] != PACKAGE)
+                raise ConfigError(
+                    f"two {self.kind}s are named {name!r}: {known!r} and {entry!r}. Choose another "
+                    f"name in {' or '.join(foreign) or module}"
+                )
+            self._entries[name] = entry
+            self._modules[name] = module
+            for listener in _LISTENERS.get(self.kind, ()):
+                listener(name)
+            return entry
+
+        return decorate
+
+    def name_of(self, entry: T) -> str:
+        """Return the name of an entry, for error messages; its own if it is not registered."""
+        known = (name for name in self if self._entries[name] is entry)
+        return next(known, getattr(entry, "__name__", repr(entry)))
+
+    def entry(self, name: str) -> T:
+        """Return an entry; if it is registered, without the imports of the first look-up.
+
+        Raises:
+            UnknownNameError: nothing is registered under ``name``.
+        """
+        return self._entries[name] if name in self._entries else self[name]
+
+    def plugin_module(self, name: str) -> str | None:
+        """Return the module outside the package that registered ``name``; None if it is built in.
+
+        Raises:
+            UnknownNameError: nothing is registered under ``name``.
+        """
+        self.entry(name)
+        module = self._modules[name]
+        return None if module.partition(".")[0] == PACKAGE else module
+
+    def __getitem__(self, name: str) -> T:
+        self._scan()
+        try:
+            return self._entries[name]
+        except KeyError:
+            raise UnknownNameError(
+                f"unknown {self.kind} {name!r}.{known_names(str(name), list(self))}. Entries from "
+                "outside the package are known once their module is imported (recipes: "
+                "'plugins=[module]'; worker processes: register_modules=[module])"
+            ) from None
+
+    def __contains__(self, name: object) -> bool:
+        self._scan()
+        return name in self._entries
+
+    def __iter__(self) -> Iterator[str]:
+        self._scan()
+        return iter(sorted(self._entries))
+
+    def __len__(self) -> int:
+        self._scan()
+        return len(self._entries)
+
+    def _scan(self) -> None:
+        if self._is_scanned:
+            return
+        package = importlib.import_module(self.package)
+        for module in pkgutil.walk_packages(package.__path__, prefix=f"{self.package}."):
+            importlib.import_module(module.name)
+        load_entry_points()
+        self._is_scanned = True
+
+
+def _is_redefinition(known: object, entry: object) -> bool:
+    """Whether two classes are definitions of the same name in the same module."""
+    return (
+        isinstance(known, type)
+        and isinstance(entry, type)
+        and (known.__module__, known.__qualname__) == (entry.__module__, entry.__qualname__)
+    )

@@ -1,0 +1,107 @@
+"""Demonstrations as a data set of TorchRL."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import torch
+from torchrl.collectors.utils import split_trajectories
+from torchrl.data import ImmutableDatasetWriter, TensorStorage
+from torchrl.data.datasets.common import BaseDatasetExperienceReplay
+from torchrl.data.replay_buffers.samplers import Sampler
+from torchrl.data.replay_buffers.writers import Writer
+from torchrl.envs import Transform
+
+from ba_torchrl.core.files import read_json
+from ba_torchrl.demonstrations.demo_files import METADATA_FILE, load_demonstrations
+
+
+class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
+    """Demonstrations as an immutable data set of TorchRL, in memory.
+
+    Transitions are in the order of their episodes, with the entries of the environment, those after
+    the step under "next", and ``episode``, the number of the episode, by which `SliceSampler` finds
+    trajectories. Images are float32, as the environment returns them.
+
+    Args:
+        dataset_id: path of demonstrations below ``root``, as `load_demonstrations` takes it; of
+            graded sets, such as ``close_loop/block_picking/expert``.
+        batch_size: of a sample; None if each call of ``sample`` passes it.
+        root: folder of data sets, such as that of ``ba-torchrl collect source=graded``; by default
+            the present one.
+        task: as for `load_demonstrations`.
+        env: as for `load_demonstrations`.
+        mapping: as for `load_demonstrations`.
+        split_trajs: items are episodes, padded to the longest, with ``mask``; else transitions.
+        sampler: of the draws; uniform by default.
+        writer: by default one that refuses to write.
+        collate_fn: as for `TensorDictReplayBuffer`.
+        pin_memory: as for `TensorDictReplayBuffer`.
+        prefetch: as for `TensorDictReplayBuffer`.
+        transform: of samples.
+
+    Raises:
+        ConfigError: as `load_demonstrations`.
+    """
+
+    def __init__(
+        self,
+        dataset_id: str | Path,
+        batch_size: int | None = None,
+        *,
+        root: str | Path | None = None,
+        task: str | None = None,
+        env: dict[str, Any] | None = None,
+        mapping: str | Path | Mapping[str, Any] | None = None,
+        split_trajs: bool = False,
+        sampler: Sampler | None = None,
+        writer: Writer | None = None,
+        collate_fn: Callable[..., Any] | None = None,
+        pin_memory: bool = False,
+        prefetch: int | None = None,
+        transform: Transform | None = None,
+    ) -> None:
+        self.dataset_id, self.root = str(dataset_id), root or "."
+        episodes = load_demonstrations(self.data_path, task=task, env=env, mapping=mapping)
+        is_own = self.data_path.joinpath(METADATA_FILE).exists()
+        self.metadata: dict[str, Any] = read_json(self.data_path / METADATA_FILE) if is_own else {}
+        """Task, parameters, source and scores, of a folder of ``ba-torchrl collect``."""
+        for number, episode in enumerate(episodes):
+            episode["episode"] = torch.full((len(episode),), number, device="cpu")
+        steps = torch.cat(episodes)
+        if split_trajs:
+            steps = split_trajectories(steps, trajectory_key="episode")
+        super().__init__(
+            storage=TensorStorage(steps),
+            sampler=sampler,
+            writer=writer or ImmutableDatasetWriter(),
+            collate_fn=collate_fn,
+            pin_memory=pin_memory,
+            prefetch=prefetch,
+            transform=transform,
+            batch_size=batch_size,
+        )
+
+    @staticmethod
+    def available_datasets(root: str | Path = ".") -> list[str]:
+        """Return the ids of the folders of demonstrations below a folder."""
+        found = (path.parent.relative_to(root) for path in Path(root).rglob(METADATA_FILE))
+        hidden = (".",)  # those that are being written
+        return sorted(
+            path.as_posix() for path in found if not any(p.startswith(hidden) for p in path.parts)
+        )
+
+    @property
+    def data_path(self) -> Path:
+        """Path of the demonstrations; `delete` removes it."""
+        return self.root / self.dataset_id
+
+    @property
+    def data_path_root(self) -> Path:
+        """The folder of data sets."""
+        return self.root
+
+    def _is_downloaded(self) -> bool:
+        return self.data_path.exists()

@@ -1,0 +1,505 @@
+"""Format: how a library names and stores the entries of demonstrations; and their card."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import numpy as np
+from pydantic import Field, ValidationError, field_validator
+from safetensors.numpy import load_file
+
+from ba_torchrl.core import keys
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.errors import (
+    ConfigError,
+    DamagedFilesError,
+    MissingPackageError,
+    install_command,
+)
+from ba_torchrl.core.files import (
+    complete_only,
+    fingerprint,
+    json_bytes,
+    write_tensors,
+    write_text,
+)
+from ba_torchrl.core.registry import Registry
+from ba_torchrl.envs.registration import gym_id
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
+
+Arrays = dict[str, np.ndarray]
+"""An episode of T steps: its entries by name, with T rows, and T + 1 rows of observations where the
+observation after the last action is known."""
+
+
+@dataclass(frozen=True)
+class Rows:
+    """An entry of an episode in a file, which is read when an array is made of it."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+    read: Callable[[], Any]
+    """Return its values."""
+    fault: str = ""
+    """Why it cannot be used."""
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
+        """Read the values.
+
+        Raises:
+            ConfigError: they cannot be read.
+        """
+        try:
+            return np.asarray(plain(self.read()), dtype)
+        except ConfigError:
+            raise
+        except Exception as error:  # libraries raise anything at files that are damaged
+            raise ConfigError(f"cannot be read: {_first_line(error)}") from error
+
+    def then(self, last: Any) -> Rows:
+        """Return these rows and one more, the last one of ``last``."""
+        shape = (sum(self.shape[:1]) + 1, *self.shape[1:])
+        return replace(
+            self, shape=shape, read=lambda: np.concatenate([self, np.asarray(last)[-1:]])
+        )
+
+
+StoredArrays = Mapping[str, np.ndarray | Rows]
+"""`Arrays` as a file has them."""
+Role = Literal["observation", "action", "result"]
+"""Of an entry: known before the step, chosen in it, or known after it."""
+RESULTS = (keys.REWARD, keys.TERMINATED, keys.TRUNCATED, keys.SUCCESS)
+"""Results of a step that files hold; ``done`` is terminated or truncated."""
+_LAST_FILE = "last_observations.safetensors"
+
+
+class Entry(StrictModel):
+    """An entry of the episodes, and its name in the file."""
+
+    name: str
+    role: Role
+    dtype: str
+    """NumPy's name of the type; "str" for text."""
+    shape: tuple[int, ...]
+    """Of one step, channels of images first."""
+    file_shape: tuple[int, ...] | None = None
+    """Of one step in the file; None in cards that do not say it."""
+
+    @property
+    def is_image(self) -> bool:
+        """Whether it has channels, rows and columns."""
+        return len(self.shape) == 3
+
+
+class Card(StrictModel):
+    """What is known of a file of demonstrations."""
+
+    card_format: Literal[3] = 3
+    format: str
+    task: str
+    task_version: int
+    expert_version: int
+    """Of the task's expert when the demonstrations were made."""
+    goal: str
+    """Of the task, in one sentence."""
+    robot: str
+    source: str
+    """How the demonstrations were made, such as "expert"; of a graded set, its grade."""
+    policy: str = ""
+    """Which acted, in words."""
+    seed: int
+    """Of the first episodes."""
+    env: dict[str, Any]
+    """Every parameter of the environment that affects the data."""
+    episodes: int
+    steps: int
+    success_rate: float
+    mean_return: float | None = None
+    """Mean sum of an episode's rewards, without discount."""
+    instructions: list[str]
+    """The different sentences, at most 20 of them; an example if they were not observed."""
+    depth: str = "float32 in metres, stored without loss: the largest error is 0"
+    license: str = "MIT"
+    versions: dict[str, str]
+    """Of the packages that wrote the file."""
+    entries: dict[str, Entry]
+    """By key of the TensorDict."""
+    checksums: dict[str, tuple[int, int]] = Field(default_factory=dict)
+    """Length and CRC-32 of each file, by its path below the folder; of a single file, by "."."""
+
+    @field_validator("entries")
+    @classmethod
+    def _check_entries(cls, entries: dict[str, Entry]) -> dict[str, Entry]:
+        if missing := {keys.ACTION, *RESULTS} - entries.keys():
+            raise ValueError(f"entries lack {', '.join(sorted(missing))}")
+        for entry in entries.values():
+            try:
+                known = entry.dtype == "str" or np.dtype(entry.dtype).kind in "fiub"
+            except TypeError:
+                known = False
+            if not known:
+                raise ValueError(f"{entry.name} has the unknown type {entry.dtype!r}")
+        return entries
+
+    @property
+    def prompt(self) -> str:
+        """The first instruction, else the task's goal."""
+        return next(iter(self.instructions), "") or self.goal
+
+    @property
+    def resolved_env(self) -> ResolvedEnv:
+        """The environment of the demonstrations."""
+        return resolve_env(self.task, self.env)
+
+    def to_markdown(self) -> str:
+        """Return the card as a page, with the fields that the Hugging Face Hub reads."""
+        rows = {
+            "task": f"`{self.task}` (Gymnasium: `{gym_id(self.task)}`): {self.goal}",
+            "version": f"{self.task_version}, expert {self.expert_version}",
+            "robot": self.robot,
+            "demonstrations": f"{self.source}, first seed {self.seed}",
+            "policy": self.policy or self.source,
+            "size": f"{self.episodes} episodes, {self.steps} steps",
+            "success": f"{self.success_rate:.3f}",
+            "mean return": "unknown" if self.mean_return is None else f"{self.mean_return:.3f}",
+            "instructions": "; ".join(self.instructions) or "none",
+            "depth and heights": self.depth,
+            "licence": self.license,
+            "versions": ", ".join(f"{name} {version}" for name, version in self.versions.items()),
+        }
+        lines = ["---", f"license: {self.license.lower()}", "task_categories: [robotics]"]
+        lines += [f"tags: [{FORMATS[self.format].tag}, BulletArm, imitation-learning]", "---", ""]
+        lines += [f"# Demonstrations of {self.task}", "", "| | |", "|---|---|"]
+        lines += [f"| {name} | {value} |" for name, value in rows.items()]
+        lines += ["", "| name | meaning | type | shape of a step |", "|---|---|---|---|"]
+        for key, entry in self.entries.items():
+            shape = entry.shape if entry.file_shape is None else entry.file_shape
+            lines.append(
+                f"| `{entry.name}` | {entry.role} `{key}` | {entry.dtype} | {list(shape)} |"
+            )
+        return "\n".join(lines) + "\n"
+
+
+class Format(ABC):
+    """A library's format of demonstrations, registered under its name."""
+
+    channels_last: ClassVar[bool] = False
+    """Whether images are stored with their channels last."""
+    has_last_observation: ClassVar[bool] = True
+    """Whether the observation after the last action has a place; if not, a file beside holds it."""
+    before_first_step: ClassVar[str | None] = None
+    """Prefix of the entries that have a row before the first step, as observations have."""
+    tag: ClassVar[str] = "BA-TorchRL"
+    """Of data sets of this format on the Hugging Face Hub."""
+    suffixes: ClassVar[tuple[str, ...]] = ()
+    """Of its files, one of which a path must have; none for folders."""
+    package: ClassVar[str]
+    """The package to install."""
+    hint: ClassVar[str] = ""
+    """What else that package needs."""
+
+    @abstractmethod
+    def matches(self, path: Path) -> bool:
+        """Return whether a file or folder looks as if it had this format."""
+
+    @abstractmethod
+    def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
+        """Return the names of entries in the file, after the library's convention, by key."""
+
+    def file_shape(self, entry: Entry) -> tuple[int, ...]:
+        """Return the shape of a step of an entry in the file."""
+        if self.channels_last and entry.is_image:
+            return (*entry.shape[1:], entry.shape[0])
+        return entry.shape
+
+    @abstractmethod
+    def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
+        """Write episodes, whose entries have their names in the file, to a new path."""
+
+    @abstractmethod
+    def read(self, path: Path) -> Sequence[StoredArrays]:
+        """Return the episodes of a file, with all of its entries by name.
+
+        `Rows` are read later, if they are needed.
+        """
+
+    def library(self, module: str) -> Any:
+        """Import a module of the library.
+
+        Raises:
+            MissingPackageError: it is not installed.
+        """
+        try:
+            return importlib.import_module(module)
+        except ImportError as error:
+            raise MissingPackageError(
+                f"this format needs a package that is not installed ({error}): "
+                f"{install_command(self.package)}{self.hint}"
+            ) from error
+
+
+FORMATS: Registry[Format] = Registry("format", "ba_torchrl.demonstrations.formats")
+
+
+def find_format(path: Path) -> Format | None:
+    """Return the format of a file or folder of demonstrations; None if it has none of these."""
+    return next((FORMATS[name] for name in FORMATS if FORMATS[name].matches(path)), None)
+
+
+def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
+    """Write episodes with their card; they appear under their name when all is on the disk.
+
+    Args:
+        form: of the file.
+        path: new file or folder.
+        episodes: their entries by key.
+        card: of the episodes.
+    """
+    import torch
+
+    named = []
+    for arrays in episodes:
+        moved = {}
+        for key, values in arrays.items():
+            entry = card.entries[key]
+            is_moved = form.channels_last and entry.is_image
+            moved[entry.name] = np.moveaxis(values, 1, -1) if is_moved else values
+        named.append(moved)
+    with complete_only(path) as scratch:
+        form.write(scratch, named, card)
+        if not form.has_last_observation:
+            observed = [
+                entry.name
+                for entry in card.entries.values()
+                if entry.role == "observation" and entry.dtype != "str"
+            ]
+            last = {
+                name: torch.from_numpy(np.ascontiguousarray([arrays[name][-1] for arrays in named]))
+                for name in observed
+            }
+            write_tensors(scratch / _LAST_FILE, last)
+        card = card.model_copy(update={"checksums": _checksums(scratch)})
+        write_text(page_file(scratch), card.to_markdown())
+        write_text(card_file(scratch), card.model_dump_json(indent=1) + "\n")
+
+
+def read_card(path: Path) -> Card | None:
+    """Return the card of a file of demonstrations; None if it has none.
+
+    Raises:
+        ConfigError: the card is damaged, or of another version.
+    """
+    file = card_file(path)
+    if not file.exists():
+        return None
+    try:
+        text = json_bytes(file)
+        values = json.loads(text)
+        if not isinstance(values, dict) or not {"format", "entries"} <= values.keys():
+            return None  # somebody else's file of that name
+        if values.get("card_format") != Card.model_fields["card_format"].default:
+            raise ConfigError(f"{file} is of another version; export the demonstrations again")
+        card = Card.model_validate_json(text)
+    except ConfigError:
+        raise
+    except (OSError, ValueError, RecursionError) as error:
+        what: Any = error
+        if isinstance(error, ValidationError):
+            first = error.errors()[0]
+            what = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+        raise ConfigError(f"{file} is damaged: {what}") from None
+    return card
+
+
+def _checksums(path: Path) -> dict[str, tuple[int, int]]:
+    """Return length and CRC-32 of the files of an export, by their paths below it."""
+    files = [file for file in [path, *sorted(path.rglob("*"))] if file.is_file()]
+    return {file.relative_to(path).as_posix(): fingerprint(file) for file in files}
+
+
+def check_files(path: Path, card: Card) -> None:
+    """Check that an export consists of the files of its card, unaltered.
+
+    Raises:
+        DamagedFilesError: a file is missing, shorter or altered.
+    """
+    for name, (size, checksum) in card.checksums.items():
+        file = path / name
+        if not file.is_file():
+            raise DamagedFilesError(f"{file} is missing")
+        if fingerprint(file) != (size, checksum):
+            raise DamagedFilesError(
+                f"{file} was altered: {size} bytes were written, of another checksum; if it was on "
+                f"purpose, delete 'checksums' in {card_file(path)}"
+            )
+
+
+def read_file(form: Format, path: Path) -> list[StoredArrays]:
+    """Return the episodes of a file, with all of its entries by name.
+
+    Raises:
+        ConfigError: it is damaged, or a package is missing.
+    """
+    try:
+        episodes = form.read(path)
+        last_file = path / _LAST_FILE
+        last = load_file(last_file) if path.is_dir() and last_file.exists() else {}
+        return [
+            {
+                name: rows_of(values).then(last[name][i : i + 1]) if name in last else values
+                for name, values in arrays.items()
+            }
+            for i, arrays in enumerate(episodes)
+        ]
+    except ConfigError:
+        raise
+    except Exception as error:  # libraries raise anything at files that are not theirs
+        raise ConfigError(f"{path} cannot be read: {_first_line(error)}") from error
+
+
+def entry_of(arrays: StoredArrays, name: str) -> np.ndarray | Rows:
+    """Return an entry of a file.
+
+    Raises:
+        ConfigError: the file has none of that name, or it cannot be used.
+    """
+    if name not in arrays:
+        raise ConfigError(f"there is no {name!r}. Known: {', '.join(sorted(arrays))}")
+    if fault := getattr(arrays[name], "fault", ""):
+        raise ConfigError(fault)
+    return arrays[name]
+
+
+def plain(values: Any) -> np.ndarray:
+    """Return an array of numbers or of text, which libraries also return as bytes and objects.
+
+    Raises:
+        ConfigError: there are other objects.
+    """
+    array = np.asarray(values)
+    if array.dtype.kind == "T":
+        return array.astype(str)
+    if array.dtype.kind not in "OS":
+        return array
+    texts = [text.decode() if isinstance(text, bytes) else text for text in array.reshape(-1)]
+    if not all(isinstance(text, str) for text in texts):
+        raise ConfigError("holds objects, neither numbers nor text")
+    return np.array(texts, dtype=str).reshape(array.shape)
+
+
+def flatten(name: str, values: Any) -> Iterator[tuple[str, Any]]:
+    """Yield the arrays in nested dictionaries and tuples, with names such as ``a/b/0``."""
+    if isinstance(values, tuple):
+        values = dict(enumerate(values))
+    if isinstance(values, Mapping):
+        for key, part in values.items():
+            yield from flatten(f"{name}/{key}", part)
+    elif values is not None:
+        yield name, values
+
+
+def rows_of(values: Any) -> Rows:
+    """Return values, such as an array or a list, as `Rows`."""
+    if isinstance(values, Rows):
+        return values
+    array = np.asarray(values)
+    return Rows(array.shape, array.dtype, lambda: array)
+
+
+def _first_line(error: Exception) -> str:
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
+
+
+def card_file(path: Path) -> Path:
+    """Return the path of the card of a file or folder."""
+    return path / "card.json" if path.is_dir() else path.with_name(f"{path.name}.card.json")
+
+
+def page_file(path: Path) -> Path:
+    """Return the path of the card of a file or folder as a page."""
+    return path / "README.md" if path.is_dir() else path.with_name(f"{path.name}.card.md")
+
+
+class Source(StrictModel):
+    """Where the values of an entry come from, in a mapping of somebody else's demonstrations."""
+
+    source: str
+    """Name in the file."""
+    components: list[int] | None = None
+    """Indices along the last axis, in their new order; None for all."""
+    scale: float | list[float] = 1.0
+    """Factor, of all components or of each."""
+    offset: float | list[float] = 0.0
+    """Added after scaling."""
+
+    @field_validator("scale", "offset", mode="before")
+    @classmethod
+    def _read_text(cls, given: Any) -> Any:
+        """Read ``1e-3``, which is text in YAML 1.1."""
+        if isinstance(given, list):
+            return [float(value) if isinstance(value, str) else value for value in given]
+        return float(given) if isinstance(given, str) else given
+
+    def values(self, found: np.ndarray) -> np.ndarray:
+        """Return the values of an entry of an episode, from those in the file.
+
+        Raises:
+            ConfigError: there are fewer components.
+        """
+        try:
+            if self.components is not None:
+                if found.ndim < 2:
+                    raise IndexError("has one number per step, no components")
+                found = found[..., self.components]
+            if self.scale == 1.0 and self.offset == 0.0:
+                return found
+            return found * np.asarray(self.scale) + np.asarray(self.offset)
+        except (IndexError, ValueError, TypeError) as error:
+            raise ConfigError(f"{self.source}, {found.shape}: {error}") from None
+
+
+class DemonstrationMapping(StrictModel):
+    """By key of the TensorDict, the name in the file, or a `Source`."""
+
+    entries: dict[str, Source] = Field(min_length=1)
+
+    @classmethod
+    def parse(cls, mapping: str | Path | Mapping[str, Any]) -> DemonstrationMapping:
+        """Return a mapping that is given as a YAML file or as its values.
+
+        Raises:
+            ConfigError: the file cannot be read, or a value is wrong.
+        """
+        what: Any = "mapping"
+        if not isinstance(mapping, Mapping):
+            what, mapping = mapping, _read_yaml(Path(mapping))
+        if not isinstance(mapping, Mapping):
+            raise ConfigError(f"{what}: must map keys to names in the file, got {mapping!r}")
+        given = {
+            str(key): {"source": value} if isinstance(value, str) else value
+            for key, value in mapping.items()
+        }
+        try:
+            return cls.model_validate({"entries": given})
+        except ValidationError as error:
+            first = error.errors()[0]
+            where = ".".join(map(str, first["loc"][1:]))
+            raise ConfigError(f"{what}: {where}: {first['msg']}") from None
+
+
+def _read_yaml(path: Path) -> Any:
+    try:
+        import yaml
+    except ImportError as error:
+        fix = f"mappings need a package that is not installed: {install_command('omegaconf')}"
+        raise MissingPackageError(fix) from error
+    try:
+        return yaml.safe_load(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, yaml.YAMLError) as error:
+        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None

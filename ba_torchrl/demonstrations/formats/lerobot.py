@@ -1,0 +1,121 @@
+"""LeRobot's data sets."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ba_torchrl.core import keys
+from ba_torchrl.demonstrations.formats.base import FORMATS, Arrays, Card, Entry, Format
+
+_STATES = ("proprio", keys.OBSERVATION, keys.HOLDING)
+"""Keys of which the first one there is ``observation.state``."""
+_STATE, _TASK, _DONE = "observation.state", "task", "next.done"
+_VIDEO_BACKEND = "pyav"
+"""The decoder that needs no FFmpeg on the system."""
+_OWN = ("index", "episode_index", "frame_index", "timestamp", "task_index")
+"""Entries that LeRobot adds."""
+
+
+class LeRobot(Format):
+    """Parquet files with images in them: PNG for colours, float32 TIFF for depth."""
+
+    has_last_observation = False
+    package = "lerobot"
+    tag = "LeRobot"
+    hint = ". LeRobot needs Python 3.12 or later"
+
+    def matches(self, path: Path) -> bool:
+        """Return whether it is the folder of a data set."""
+        return os.path.isfile(path / "meta" / "info.json")
+
+    def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
+        """Return names: ``observation.state``, ``observation.images.NAME`` and ``next.reward``."""
+        state = next((key for key in _STATES if key in entries), None)
+        fixed = {state: _STATE, keys.INSTRUCTION: _TASK}
+        prefixes = {"observation": "observation.", "action": "", "result": "next."}
+        return {
+            key: fixed.get(key, f"{prefixes[entry.role]}{'images.' * _is_camera(entry)}{key}")
+            for key, entry in entries.items()
+        }
+
+    def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
+        """Write by `LeRobotDataset`, frame by frame."""
+        datasets = self.library("lerobot.datasets.lerobot_dataset")
+        entries = {entry.name: entry for entry in card.entries.values() if entry.dtype != "str"}
+        features = {name: _feature(entry) for name, entry in entries.items()}
+        dataset = datasets.LeRobotDataset.create(
+            repo_id=f"ba_torchrl/{path.name}",
+            fps=card.resolved_env.video_fps,
+            features={**features, _DONE: {"dtype": "bool", "shape": (1,), "names": None}},
+            root=path,
+            robot_type=card.robot,
+            use_videos=False,
+            video_backend=_VIDEO_BACKEND,
+        )
+        for arrays in episodes:
+            values = {
+                name: arrays[name].astype(features[name]["dtype"], copy=False)
+                if features[name]["dtype"] != "image"
+                else arrays[name]
+                for name in entries
+            }
+            values[_DONE] = arrays["next.terminated"] | arrays["next.truncated"]
+            for step in range(len(values[_DONE])):
+                frame: dict[str, Any] = {name: rows[step] for name, rows in values.items()}
+                frame[_TASK] = str(arrays[_TASK][step]) if _TASK in arrays else card.prompt
+                dataset.add_frame(frame)
+            dataset.save_episode()
+        dataset.finalize()
+
+    def read(self, path: Path) -> list[Arrays]:
+        """Read by `LeRobotDataset`: depth in metres, colours as uint8."""
+        datasets = self.library("lerobot.datasets.lerobot_dataset")
+        dataset = datasets.LeRobotDataset(
+            f"ba_torchrl/{path.name}",
+            root=path,
+            depth_output_unit="m",
+            video_backend=_VIDEO_BACKEND,
+        )
+        cameras = set(dataset.meta.camera_keys) - set(dataset.meta.depth_keys)
+        episodes: dict[int, list[dict[str, Any]]] = {}
+        for i in range(len(dataset)):
+            frame = dataset[i]
+            episodes.setdefault(int(frame["episode_index"]), []).append(frame)
+        return [_stacked(frames, cameras) for _, frames in sorted(episodes.items())]
+
+
+def _stacked(frames: list[dict[str, Any]], cameras: set[str]) -> Arrays:
+    """Return the frames of an episode as arrays; numbers have a last axis of one."""
+    arrays: Arrays = {}
+    for name in frames[0].keys() - set(_OWN):
+        values = [frame[name] for frame in frames]
+        if isinstance(values[0], str):
+            arrays[name] = np.array(values)
+            continue
+        rows = np.stack([value.numpy() for value in values])
+        if name in cameras and rows.dtype.kind == "f":
+            rows = (rows * 255).round().astype(np.uint8)
+        arrays[name] = rows[:, None] if rows.ndim == 1 else rows
+    return arrays
+
+
+def _is_camera(entry: Entry) -> bool:
+    """Whether LeRobot stores the entry as an image: a depth map, or colours."""
+    return entry.is_image and (entry.shape[0], entry.dtype) in ((1, "float32"), (3, "uint8"))
+
+
+def _feature(entry: Entry) -> dict[str, Any]:
+    """Return LeRobot's declaration of an entry."""
+    if _is_camera(entry):
+        feature = {"dtype": "image", "shape": entry.shape, "names": ["channels", "height", "width"]}
+        return feature | ({"info": {"is_depth_map": True}} if entry.dtype == "float32" else {})
+    dtype = "float32" if entry.name == _STATE else entry.dtype
+    return {"dtype": dtype, "shape": entry.shape, "names": None}
+
+
+FORMATS.register("lerobot")(LeRobot())

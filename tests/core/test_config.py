@@ -1,0 +1,139 @@
+import json
+import pickle
+
+import pytest
+from omegaconf import OmegaConf
+
+import ba_torchrl
+from ba_torchrl.core.config import EnvConfig, TaskParameters, env_config_model, parse
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
+from ba_torchrl.core.registry import Registry
+from ba_torchrl.envs.settings import resolve_env
+
+
+def test_unknown_parameter_names_the_nearest_and_all_known():
+    with pytest.raises(ConfigError, match="Did you mean 'max_steps'") as error:
+        ba_torchrl.make("close_loop/block_picking", max_step=3)
+    assert "random_orientation" in str(error.value)
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"max_steps": "10"}, "max_steps: .*integer"),
+        ({"max_steps": 0}, "max_steps: .*greater"),
+        ({"random_orientation": 1}, "random_orientation: .*boolean"),
+        ({"obs_size": 4}, "obs_size"),
+        ({"workspace": [0.3, 0.6]}, "three .low, high. pairs"),
+        ({"workspace": [[0.6, 0.3], [-0.1, 0.1], [0, 1]]}, "low < high"),
+        ({"object_scale_range": [1.2, 0.8]}, "low <= high"),
+        ({"object_scale_range": True}, "a number or a"),
+        ({"workspace_check": "box"}, "bounding_box"),
+        ({"dpos": 0.0}, "dpos"),
+    ],
+)
+def test_wrong_values_say_what_is_allowed(values, message):
+    with pytest.raises(ConfigError, match=message):
+        parse(EnvConfig, values, "configuration")
+
+
+class Sequences(TaskParameters):
+    sizes: tuple[tuple[float, float], ...] = ((1.0, 2.0),)
+    vector_keys: tuple[str, ...] = ()
+    names: list[str] = []  # noqa: RUF012 -- pydantic copies it
+    by_name: dict[str, tuple[int, ...] | None] = {}  # noqa: RUF012
+
+
+@pytest.mark.parametrize("model", [Sequences, env_config_model(Sequences)])
+def test_lists_and_tuples_are_what_the_types_ask_for(model):
+    given = {"sizes": [[3.0, 4.0]], "vector_keys": ["a"], "names": ("b",), "by_name": {"c": [1]}}
+    config = parse(model, given, "c")
+    assert config.sizes == ((3.0, 4.0),)
+    assert config.vector_keys == ("a",)
+    assert config.names == ["b"]
+    assert config.by_name == {"c": (1,)}
+    for each in (config, model()):
+        assert parse(model, json.loads(each.model_dump_json()), "c") == each
+        values = OmegaConf.to_container(OmegaConf.create(each.model_dump()))  # as Hydra composes
+        assert parse(model, values, "c") == each
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"vector_keys": "ab"},
+        {"names": "ab"},
+        {"vector_keys": [1]},
+        {"sizes": [[1.0]]},
+        {"names": 1},
+    ],
+)
+def test_sequences_remain_strict(values):
+    (name,) = values
+    with pytest.raises(ConfigError, match=rf"\n  {name}"):
+        parse(Sequences, values, "c")
+
+
+def test_a_parameter_of_a_task_cannot_repeat_one_of_every_environment():
+    class Parameters(TaskParameters):
+        max_steps: int = 3
+
+    with pytest.raises(TypeError, match=r"Parameters repeats .*: max_steps"):
+        env_config_model(Parameters)
+
+
+def test_scale_takes_a_number_or_a_pair():
+    assert parse(EnvConfig, {"object_scale_range": 0.6}, "c").object_scale_range == (0.6, 0.6)
+    assert parse(EnvConfig, {"object_scale_range": [0.6, 0.7]}, "c").object_scale_range == (
+        0.6,
+        0.7,
+    )
+
+
+def test_unknown_task_and_robot_list_the_known_ones():
+    with pytest.raises(ConfigError, match="close_loop/block_picking"):
+        ba_torchrl.make("close_loop/block_pickin")
+    with pytest.raises(ConfigError, match=r"Known: .*kuka"):
+        ba_torchrl.make("close_loop/block_picking", robot="baxter")
+
+
+def test_actions_that_do_not_suit_the_task_are_refused():
+    for sequence in ("pxy", "pxyzrr", "xyz", "pxyzq", "ppxyz"):
+        with pytest.raises(ConfigError, match="close-loop"):
+            ba_torchrl.make("close_loop/block_picking", action_sequence=sequence)
+
+
+def test_workspaces_out_of_reach_or_too_small_are_refused():
+    with pytest.raises(ConfigError, match="cannot reach"):
+        ba_torchrl.make(
+            "close_loop/block_picking", workspace=[[0.5, 1.2], [-0.3, 0.3], [0.01, 0.25]]
+        )
+    with pytest.raises(ConfigError, match="enlarge `workspace`"):
+        ba_torchrl.make(
+            "close_loop/block_picking", workspace=[[0.4, 0.5], [-0.05, 0.05], [0.01, 0.25]]
+        )
+
+
+def test_registry_refuses_two_entries_of_one_name():
+    registry: Registry[object] = Registry("thing", "ba_torchrl.tasks.close_loop")
+    registry.register("a")(1)
+    with pytest.raises(ConfigError, match=r"two things are named 'a'.*another name in tests\."):
+        registry.register("a")(2)
+    with pytest.raises(UnknownNameError, match="unknown thing 'b'"):
+        registry["b"]
+
+
+def test_list_tasks_is_sorted_and_complete():
+    tasks = ba_torchrl.list_tasks()
+    assert tasks == sorted(tasks)
+    assert {
+        f"close_loop/block_{verb}" for verb in ("reaching", "picking", "pushing", "pulling")
+    } <= set(tasks)
+
+
+@pytest.mark.parametrize("task", ["open_loop/block_stacking", "close_loop/object_grasping"])
+def test_a_configuration_with_parameters_of_its_task_can_be_pickled(task):
+    config = resolve_env(task, {"seed": 3}).config
+    restored = pickle.loads(pickle.dumps(config))
+    assert restored == config
+    assert type(restored) is type(config)

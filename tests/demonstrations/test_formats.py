@@ -1,0 +1,975 @@
+"""Demonstrations in other libraries' formats; most episodes are made by hand."""
+
+import json
+import pickle
+import shutil
+import sys
+import zipfile
+from contextlib import nullcontext
+from pathlib import Path
+from types import SimpleNamespace
+
+import gymnasium
+import h5py
+import numpy as np
+import pytest
+import torch
+import zarr
+from tensordict import NonTensorStack, TensorDict
+from torchrl.data.datasets import MinariExperienceReplay
+
+import ba_torchrl
+from ba_torchrl.core.errors import (
+    ConfigError,
+    DamagedFilesError,
+    MissingPackageError,
+    UnknownNameError,
+)
+from ba_torchrl.demonstrations import (
+    collect_demonstrations,
+    exchange,
+    export_demonstrations,
+    load_demonstrations,
+    save_demonstrations,
+)
+from ba_torchrl.demonstrations.collect import source_config
+from ba_torchrl.demonstrations.demo_files import check_demonstrations, read_demonstrations
+from ba_torchrl.demonstrations.formats import base
+from ba_torchrl.demonstrations.formats.base import FORMATS, Format, read_card
+from tests.training.test_limits import limited
+
+TASK, ENV, SIZE = "close_loop/block_picking", {"obs_size": 64}, 64
+PATHS = {
+    "minari": "picking-v0",
+    "hdf5": "picking.hdf5",
+    "zarr": "picking.zarr",
+    "lerobot": "picking",
+}
+SHAPES = {
+    "depth": ((1, SIZE, SIZE), torch.float32),
+    "in_hand": ((3, 24, 24), torch.float32),
+    "wrist_rgb": ((3, 48, 48), torch.uint8),
+    "segmentation": ((1, SIZE, SIZE), torch.int32),
+    "point_cloud": ((16, 3), torch.float32),
+    "proprio": ((8,), torch.float32),
+    "holding": ((1,), torch.bool),
+}
+
+
+def values(shape, dtype, generator):
+    numbers = torch.rand(shape, generator=generator)
+    if dtype == torch.bool:
+        return numbers > 0.5
+    return numbers if dtype.is_floating_point else (200 * numbers).to(dtype)
+
+
+def episode(steps, seed, success=True):
+    """Return an episode [steps] with all kinds of entries."""
+    generator = torch.Generator().manual_seed(seed)
+    now, following = {}, {}
+    for key, (shape, dtype) in SHAPES.items():
+        rows = values((steps + 1, *shape), dtype, generator)
+        now[key], following[key] = rows[:-1], rows[1:]
+    for key in ("action", "expert_action"):
+        now[key] = values((steps, 5), torch.float32, generator)
+    now["is_expert"] = values((steps, 1), torch.bool, generator)
+    is_last = torch.arange(steps)[:, None] == steps - 1
+    following["success"] = following["terminated"] = is_last & success
+    following["truncated"] = is_last & (not success)
+    following["done"], following["fault"] = is_last, torch.zeros_like(is_last)
+    following["reward"] = following["success"].float()
+    following["step_count"] = torch.arange(1, steps + 1)[:, None]
+    for key in ("success", "terminated", "truncated", "done", "fault", "step_count"):
+        now[key] = torch.cat([torch.zeros_like(following[key][:1]), following[key][:-1]])
+    text = [f"pick up block {seed}"] * steps
+    now["instruction"], following["instruction"] = NonTensorStack(*text), NonTensorStack(*text)
+    return TensorDict({**now, "next": TensorDict(following, [steps])}, [steps]).clone()
+
+
+@pytest.fixture
+def episodes():
+    return [episode(3, 0), episode(2, 1, success=False), episode(4, 2)]
+
+
+@pytest.fixture(scope="module")
+def collected():
+    env = ba_torchrl.make_vector_env(
+        TASK, 1, parallel=False, seed=0, **ENV, **source_config("expert")
+    )
+    yield collect_demonstrations(env, 2, seed=0, noise=0.2)
+    env.close()
+
+
+def exported(path, episodes, name, **changes):
+    options = {"format": name, "task": TASK, "env": ENV, "seed": 7, **changes}
+    export_demonstrations(path / PATHS[name], episodes, **options)
+    return path / PATHS[name]
+
+
+def assert_equal(found, wanted):
+    assert len(found) == len(wanted)
+    for one, other in zip(found, wanted, strict=True):
+        assert set(one.keys(True, True)) == set(other.keys(True, True))
+        for key in other.keys(True, True):
+            ours, theirs = one.get(key), other.get(key)
+            if isinstance(theirs, torch.Tensor):
+                assert ours.dtype == theirs.dtype, key
+                assert torch.equal(ours, theirs), key
+            else:
+                assert ours.tolist() == theirs.tolist(), key
+
+
+@pytest.mark.parametrize("name", ["hdf5", "zarr", "lerobot"])
+def test_every_value_comes_back(name, episodes, tmp_path):
+    if name == "lerobot":
+        pytest.importorskip("lerobot")
+    path = exported(tmp_path, episodes, name, policy="a hand")
+    card = base.card_file(path)
+    card.write_text(card.read_text(), encoding="utf-8-sig")  # by an editor
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
+    card = read_card(path)
+    assert (card.policy, card.mean_return) == ("a hand", card.success_rate)
+    assert (card.task, card.robot, card.seed, card.source) == (TASK, "kuka", 7, "expert")
+    assert (card.episodes, card.steps, card.success_rate) == (3, 9, pytest.approx(2 / 3))
+    assert card.instructions == [f"pick up block {i}" for i in range(3)]
+    page = (
+        path / "README.md" if path.is_dir() else path.with_name("picking.hdf5.card.md")
+    ).read_text()
+    assert f"| `{card.entries['proprio'].name}` | observation `proprio` | float32 | [8] |" in page
+    image = [1, SIZE, SIZE] if name == "lerobot" else [SIZE, SIZE, 1]
+    assert f"| `{card.entries['depth'].name}` | observation `depth` | float32 | {image} |" in page
+    reward = [] if name == "hdf5" else [1]
+    assert f"| result `reward` | float32 | {reward} |" in page
+    assert ("LeRobot" in page) == (name == "lerobot")
+    assert card.entries["depth"].shape == (1, SIZE, SIZE)
+
+
+@pytest.mark.parametrize("name", ["minari", "hdf5", "zarr", "lerobot"])
+def test_episodes_of_an_environment_come_back(name, collected, tmp_path):
+    if name == "lerobot":
+        pytest.importorskip("lerobot")
+    path = exported(tmp_path, collected, name)
+    check_demonstrations(path, task=TASK, env=ENV, least=2)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), collected)
+    with pytest.raises(ConfigError, match="obs_size: collected with 64, needed 128"):
+        load_demonstrations(path, task=TASK, env={})
+    with pytest.raises(ConfigError, match="holds 2 episodes, 3 are needed"):
+        check_demonstrations(path, task=TASK, env=ENV, least=3)
+    with pytest.raises(ConfigError, match="exists already"):
+        exported(tmp_path, collected, name)
+
+
+@pytest.mark.parametrize("name", ["minari", "hdf5", "zarr", "lerobot"])
+def test_an_export_that_fails_in_the_middle_leaves_nothing(name, collected, tmp_path, monkeypatch):
+    if name == "lerobot":
+        pytest.importorskip("lerobot")
+    write = type(FORMATS[name]).write
+
+    def write_one_and_stop(self, path, episodes, card):
+        write(self, path, episodes[:1], card)
+        raise KeyboardInterrupt
+
+    def stop(*_):
+        raise KeyboardInterrupt
+
+    for what in ((type(FORMATS[name]), "write", write_one_and_stop), (base, "card_file", stop)):
+        with monkeypatch.context() as patch:
+            patch.setattr(*what)
+            with pytest.raises(KeyboardInterrupt):
+                exported(tmp_path, collected, name)
+        assert list(tmp_path.iterdir()) == []
+    killed = tmp_path / f".{PATHS[name]}.scratch" / PATHS[name]  # left by a process that was killed
+    (killed / "data").mkdir(parents=True)
+    path = exported(tmp_path, collected, name)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), collected)
+    assert not killed.parent.exists()
+
+
+def test_a_full_disk_is_an_error_of_the_system(collected, tmp_path, monkeypatch):
+    """HDF5 itself would end the process."""
+    with limited("RLIMIT_FSIZE", 100_000), pytest.raises(OSError, match="File too large"):
+        exported(tmp_path, [episode.repeat(9) for episode in collected], "hdf5")
+    full = SimpleNamespace(free=100_000)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+    with pytest.raises(OSError, match=r"No space left on device: .* needed, 0.1 MB are free"):
+        exported(tmp_path, collected, "minari")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):
+    import minari
+
+    exported(tmp_path, collected, "minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    dataset = minari.load_dataset(PATHS["minari"])
+    env = dataset.recover_environment()
+    assert env.observation_space["depth"] == dataset.observation_space["depth"]
+    assert env.spec.id == "BulletArm/CloseLoopBlockPicking-v0"
+    env.reset(seed=0)
+    first = next(iter(dataset.iterate_episodes()))
+    for action, depth in zip(first.actions, first.observations["depth"][1:], strict=True):
+        np.testing.assert_array_equal(env.step(action)[0]["depth"], depth)
+    env.close()
+
+
+def test_torchrl_reads_what_minari_wrote(collected, tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    exported(tmp_path, collected, "minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    monkeypatch.setattr(TensorDict, "memmap_like", TensorDict.memmap)  # which 0.14.1 must call
+    data = MinariExperienceReplay(
+        PATHS["minari"], batch_size=4, root=tmp_path / "torchrl", load_from_local_minari=True
+    )[:]
+    steps = torch.cat(collected)
+    ours = [("depth",), ("holding",), ("next", "depth"), ("next", "holding")]
+    theirs = [(*key[:-1], "observation", key[-1]) for key in ours]
+    same = [("action",), ("next", "reward"), ("next", "terminated"), ("next", "truncated")]
+    for key, name in zip([*ours, *same], [*theirs, *same], strict=True):
+        assert torch.equal(data[name], steps[key]), key
+    lengths = torch.tensor([len(each) for each in collected])
+    assert torch.equal(data["episode"], torch.arange(2).repeat_interleave(lengths))
+
+
+def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):
+    options = {"format": "minari", "task": TASK, "env": ENV, "seed": 0}
+    for name in ("pick ing", "picking", "picking-v"):
+        with pytest.raises(ConfigError, match=f"{name} is no id of a data set"):
+            export_demonstrations(tmp_path / name, collected, **options)
+    with pytest.raises(ConfigError, match=r"does not observe .*wrist_rgb"):
+        export_demonstrations(tmp_path / "a-v0", episodes, **options)
+
+
+def test_minari_has_infos_of_the_reset(collected, tmp_path):
+    minari = pytest.importorskip("minari")
+    path = exported(tmp_path, collected, "minari")
+    for found, ours in zip(
+        minari.MinariDataset(path / "data").iterate_episodes(), collected, strict=True
+    ):
+        steps = len(ours)
+        assert {len(rows) for rows in found.infos.values()} == {steps + 1}
+        np.testing.assert_array_equal(found.infos["success"][1:], ours["next", "success"])
+        assert not found.infos["success"][0]
+        np.testing.assert_array_equal(found.infos["expert_action"][:-1], ours["expert_action"])
+
+
+@pytest.mark.filterwarnings("ignore::UserWarning")  # of what a card of Minari lacks
+@pytest.mark.parametrize("rows", [3, 4])  # without and with those of the reset
+def test_nested_observations_and_infos_of_minari_are_mapped(rows, tmp_path, monkeypatch):
+    minari = pytest.importorskip("minari")
+    spaces = gymnasium.spaces
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    depth = np.random.default_rng(0).uniform(0.1, 0.2, (4, SIZE, SIZE)).astype(np.float32)
+    buffer = minari.data_collector.EpisodeBuffer(
+        id=0,
+        observations={"arm": {"depth": depth, "grip": np.linspace(0, 1, 4)[:, None]}},
+        actions=np.full((3, 5), np.linspace(-1, 1, 3)[:, None]),
+        rewards=np.zeros(3),
+        terminations=np.array([False, False, True]),
+        truncations=np.zeros(3, dtype=bool),
+        infos={"won": {"all": np.array([0, 0, 0, 1])[4 - rows :]}},
+    )
+    arm = {"depth": spaces.Box(0, 1, depth.shape[1:]), "grip": spaces.Box(0, 1, (1,), np.float64)}
+    minari.create_dataset_from_buffers(
+        "theirs-v0",
+        [buffer],
+        observation_space=spaces.Dict({"arm": spaces.Dict(arm)}),
+        action_space=spaces.Box(-1, 1, (5,), np.float64),
+    )
+    mapping = {
+        "depth": "observations/arm/depth",
+        "holding": "observations/arm/grip",
+        "action": "actions",
+        "success": "infos/won/all",
+    }
+    options = {"task": TASK, "env": ENV, "mapping": mapping}
+    check_demonstrations(tmp_path / "theirs-v0", **options)
+    (found,) = load_demonstrations(tmp_path / "theirs-v0", **options)
+    np.testing.assert_array_equal(found["next", "depth"][:, 0], depth[1:])
+    assert found["holding"].flatten().tolist() == [False, False, True]
+    assert found["next", "success"].flatten().tolist() == [False, False, True]
+
+
+def test_hdf5_has_the_layout_of_robomimic(episodes, tmp_path):
+    with h5py.File(exported(tmp_path, episodes, "hdf5")) as file:
+        assert file["data"].attrs["total"] == 9
+        env_args = json.loads(file["data"].attrs["env_args"])
+        assert env_args["env_name"] == "BulletArm/CloseLoopBlockPicking-v0"
+        demo = file["data/demo_1"]
+        assert demo.attrs["num_samples"] == 2
+        assert demo["obs/wrist_rgb"].shape == demo["next_obs/wrist_rgb"].shape == (2, 48, 48, 3)
+        assert demo["dones"][:].tolist() == [0, 1]
+        assert demo["rewards"].shape == (2,)
+        np.testing.assert_array_equal(demo["actions"], episodes[1]["action"])
+        assert json.loads(demo.attrs["ep_meta"]) == {"lang": "pick up block 1"}
+
+
+def test_zarr_has_the_layout_of_diffusion_policy(episodes, tmp_path):
+    root = zarr.open(str(exported(tmp_path, episodes, "zarr")), mode="r")
+    assert root["meta/episode_ends"][:].tolist() == [3, 5, 9]
+    assert root["data/wrist_rgb"].shape == (9, 48, 48, 3)
+    np.testing.assert_array_equal(root["data/action"][3:5], episodes[1]["action"])
+
+
+def test_lerobot_has_its_names(episodes, tmp_path):
+    pytest.importorskip("lerobot")
+    exported(tmp_path, episodes, "lerobot")
+    info = json.loads((tmp_path / PATHS["lerobot"] / "meta/info.json").read_text())
+    features = info["features"]
+    assert features["observation.state"]["shape"] == [8]
+    assert features["observation.images.wrist_rgb"]["dtype"] == "image"
+    assert features["observation.images.depth"]["info"]["is_depth_map"]
+    assert {"action", "next.reward", "next.done", "next.success"} <= features.keys()
+
+
+# Another robot's teleoperation: depth in millimetres with channels last, an action of
+# (x, y, z, yaw, gripper) in metres, radians and opening.
+FOREIGN = {
+    "depth": {"source": "obs/depth", "scale": 0.001},
+    "holding": {"source": "obs/state", "components": [1], "scale": -1, "offset": 1},
+    "action": {
+        "source": "actions",
+        "components": [4, 0, 1, 2, 3],
+        "scale": [2, 20, 20, 20, 1],
+        "offset": [-1, 0, 0, 0, 0],
+    },
+}
+
+
+def foreign(path, **changes):
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for i, steps in enumerate((3, 2)):
+            data = {
+                "obs/depth": rng.integers(0, 200, (steps, SIZE, SIZE, 1), dtype=np.uint16),
+                "obs/state": np.array([[0.1, 0.2], [0.3, 0.9], [0.6, 0.4]]),
+                "actions": rng.uniform(0, 0.05, (steps, 5)),
+                **changes,
+            }
+            for name, rows in data.items():
+                file[f"data/demo_{i}/{name}"] = rows[:steps]
+    return path
+
+
+@pytest.mark.parametrize("as_file", [False, True])
+def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
+    path = foreign(tmp_path / "teleoperation.hdf5")
+    mapping = FOREIGN
+    if as_file:
+        mapping = tmp_path / "mapping.yaml"
+        mapping.write_text(json.dumps(FOREIGN))  # JSON is YAML
+    first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    with h5py.File(path) as file:
+        demo = file["data/demo_0"]
+        depth, action = demo["obs/depth"][:], demo["actions"][:]
+    pixels = torch.from_numpy(depth.transpose(0, 3, 1, 2) * 0.001).float()
+    assert torch.equal(first["depth"], pixels)
+    assert torch.equal(first["next", "depth"], torch.cat([pixels[1:], pixels[-1:]]))
+    assert first["holding"].flatten().tolist() == [True, False, True]
+    wanted = np.c_[action[:, 4] * 2 - 1, action[:, :3] * 20, action[:, 3]]
+    np.testing.assert_allclose(first["action"], wanted, rtol=1e-6)
+    assert second["next", "success"].flatten().tolist() == [False, True]
+    assert second["next", "terminated"].flatten().tolist() == [False, True]
+    assert second["next", "reward"].flatten().tolist() == [0, 1]
+    env = ba_torchrl.make(TASK, seed=0, **ENV)
+    plain = env.rollout(2)
+    env.close()
+    assert set(first.keys(True, True)) == set(plain.keys(True, True))
+    for key in plain.keys(True, True):
+        assert first[key].dtype == plain[key].dtype, key
+        assert first[key].shape[1:] == plain[key].shape[1:], key
+
+
+def test_failures_of_another_robot_are_mapped(tmp_path):
+    path = foreign(tmp_path / "b.hdf5", won=np.zeros(3))
+    found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
+    assert not any(each["next", "success"].any() for each in found)
+    assert found[0]["next", "truncated"].flatten().tolist() == [False, False, True]
+    assert found[0]["next", "reward"].sum() == 0
+
+
+@pytest.mark.parametrize(
+    ("results", "success", "terminated"),
+    [
+        ({"success": "won"}, True, True),
+        ({"reward": "won"}, True, True),
+        ({"terminated": "won"}, True, True),
+        ({"success": "won", "terminated": "never"}, True, True),
+        ({"success": "won", "reward": "won", "truncated": "won"}, True, True),
+        ({"success": "never", "terminated": "won"}, False, True),
+        ({"success": "never", "truncated": "won"}, False, False),
+    ],
+)
+def test_an_episode_ends_at_its_first_success_or_end(
+    results, success, terminated, tmp_path, caplog
+):
+    path = foreign(tmp_path / "a.hdf5", won=np.array([0, 1, 1]), never=np.zeros(3))
+    mapping = {**FOREIGN, **results}
+    check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert caplog.messages == []
+    first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert caplog.messages == [
+        f"{path}: 1 of 5 steps are left out, those after the first success or end of an episode"
+    ]
+    whole, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    assert torch.equal(first["next", "depth"], whole["next", "depth"][:2])
+    for each in (first, second):
+        following = each["next"]
+        assert following["done"].flatten().tolist() == [False, True]
+        assert following["reward"].flatten().tolist() == [0, float(success)]
+        assert following["success"].flatten().tolist() == [False, success]
+        assert following["terminated"].flatten().tolist() == [False, terminated]
+
+
+def test_rewards_without_success_tell_it(tmp_path, caplog):
+    path = foreign(tmp_path / "a.hdf5", rewards=np.array([0, 0, 1]), zero=np.zeros(3))
+    options = {"task": TASK, "env": ENV}
+    found = load_demonstrations(path, mapping={**FOREIGN, "reward": "rewards"}, **options)
+    assert [each["next", "success"].sum() for each in found] == [1, 0]
+    assert caplog.messages == []
+    found = load_demonstrations(path, mapping={**FOREIGN, "reward": "zero"}, **options)
+    assert [each["next", "success"].sum() for each in found] == [1, 1]
+    (message,) = caplog.messages
+    assert "the rewards are all 0, and every episode counts as a success: map success" in message
+
+
+def test_a_constant_entry_is_named(tmp_path, caplog):
+    path = foreign(tmp_path / "a.hdf5", still=np.zeros((3, 5)))
+    load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "action": "still"})
+    assert caplog.messages == [f"{path}: action is 0 in all steps; is it the right entry?"]
+
+
+def test_an_episode_of_a_task_that_terminates_at_its_limit_is_terminated():
+    arrays = {"action": np.zeros((2, 4)), "success": np.zeros((2, 1))}
+    found = exchange._with_results(arrays, "open_loop/object_grasping", {})
+    assert found["terminated"].tolist() == [[False], [True]]
+    assert not found["truncated"].any()
+
+
+def test_a_sentence_that_is_observed_is_needed(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    env = {**ENV, "observations": ["instruction"]}
+    with pytest.raises(ConfigError, match="the mapping has no instruction"):
+        check_demonstrations(path, task=TASK, env=env, mapping=FOREIGN)
+
+
+@pytest.mark.parametrize(
+    ("results", "message"),
+    [
+        ({"success": "half"}, r"success: has values from 0 to 0\.6, needed 0 or 1"),
+        ({"reward": "minus"}, "reward: has values from -1 to 0, needed 0 or 1; set scale"),
+        ({"success": "won", "reward": "late"}, "step 1 of 2 has the reward 0 and the success 1"),
+        ({"success": "late", "reward": "won"}, "step 1 of 3 has the reward 1 and the success 0"),
+        ({"success": {"source": "won", "components": [0]}}, "one number per step, no components"),
+        ({"instruction": "words"}, r"instruction: found \['lift', 'push'\], needed one sentence"),
+        ({"instruction": "empty"}, r"instruction: found \[''\], needed one sentence"),
+    ],
+)
+def test_results_that_contradict_their_meaning_are_refused(results, message, tmp_path):
+    path = foreign(
+        tmp_path / "a.hdf5",
+        won=np.array([0, 1, 1]),
+        late=np.array([0, 0, 1]),
+        half=np.array([0, 0.3, 0.6]),
+        minus=np.array([-1, -1, 0]),
+        words=["push", "lift", "lift"],
+        empty=[""] * 3,
+    )
+    with pytest.raises(ConfigError, match=rf"a\.hdf5, episode 0: .*{message}"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, **results})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"holding": None}, "the mapping has no holding"),
+        ({"gripper": "obs/state"}, "the environment has no gripper. Known: .*holding"),
+        ({"holding": "obs/grip"}, "episode 0: holding: there is no 'obs/grip'. Known: .*obs/state"),
+        ({"holding": "obs/state"}, r"holding: has the shape \[2\], needed \[1\]"),
+        ({"depth": "obs/depth"}, r"depth: has values from 0 to 199, needed .*; set scale"),
+        ({"action": {"source": "actions", "offset": -3}}, "action: has values from -2.99"),
+        ({"action": {"source": "actions", "components": [9]}}, "action: actions.*out of bounds"),
+        ({"action": {"source": "actions", "scale": [1, 2]}}, "action: actions.*broadcast"),
+        ({"action": {"sauce": "actions"}}, "mapping: action.*: Field required"),
+        ({"instruction": "obs/state"}, "episode 0: instruction: is no text"),
+    ],
+)
+def test_mappings_that_do_not_fit_are_refused_by_name(changes, message, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    mapping = {key: value for key, value in {**FOREIGN, **changes}.items() if value is not None}
+    with pytest.raises(ConfigError, match=message):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_colours_between_0_and_1_are_scaled_and_rounded(dtype, tmp_path):
+    env = {**ENV, "observations": ["wrist_rgb"]}
+    colours = np.random.default_rng(0).integers(0, 256, (3, SIZE, SIZE, 3), dtype=np.uint8)
+    path = foreign(tmp_path / "a.hdf5", rgb=(colours / 255).astype(dtype))
+    for source in ("rgb", {"source": "rgb", "scale": 1.0}):
+        with pytest.raises(ConfigError, match=r"wrist_rgb: has values from 0 to 1, .*scale: 255"):
+            load_demonstrations(path, task=TASK, env=env, mapping={**FOREIGN, "wrist_rgb": source})
+    mapping = {**FOREIGN, "wrist_rgb": {"source": "rgb", "scale": 255}}
+    first, _ = load_demonstrations(path, task=TASK, env=env, mapping=mapping)
+    np.testing.assert_array_equal(first["wrist_rgb"], colours.transpose(0, 3, 1, 2))
+
+
+def test_depth_without_an_axis_of_channels_fits(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    wanted, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo["flat"] = demo["obs/depth"][..., 0]
+    mapping = {**FOREIGN, "depth": {"source": "flat", "scale": 0.001}}
+    check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    found, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert torch.equal(found["depth"], wanted["depth"])
+
+
+def test_numbers_that_yaml_reads_as_text_are_numbers(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    wanted, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    text = json.dumps(FOREIGN).replace("0.001", "1e-3").replace("[2, 20", "[2e0, 2e1")
+    (tmp_path / "a.yaml").write_text(text.replace('"offset": 1}', '"offset": 1e0}'))
+    options = {"task": TASK, "env": ENV, "mapping": tmp_path / "a.yaml"}
+    found, _ = load_demonstrations(path, **options)
+    assert_equal([found], [wanted])
+    (tmp_path / "a.yaml").write_text(text.replace("1e-3", "1e-3m"))
+    with pytest.raises(ConfigError, match=r"depth\.scale: .*could not convert string to float"):
+        load_demonstrations(path, **options)
+
+
+def test_links_in_hdf5_are_followed(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    wanted = load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        for name, demo in file["data"].items():
+            file.move(f"data/{name}/obs/depth", f"images/{name}")
+            demo["obs/depth"] = h5py.SoftLink(f"/images/{name}")
+            demo["obs/second"] = demo["actions"]  # a hard link
+            demo["obs/loop"] = h5py.SoftLink(f"/data/{name}")
+            demo["obs/lost"] = h5py.SoftLink("/nowhere")
+            demo["obs/elsewhere"] = h5py.ExternalLink("none.hdf5", "/a")
+    mapping = {**FOREIGN, "action": {**FOREIGN["action"], "source": "obs/second"}}
+    check_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV, mapping=mapping), wanted)
+
+
+def test_hdf5_is_read_where_it_is_mapped_and_checked_by_shapes(tmp_path, monkeypatch):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo.create_dataset("obs/camera", (3, 1 << 20, 1 << 20), "f8", chunks=(1, 64, 64))
+            demo["obs/nothing"] = h5py.Empty("f4")
+            demo.attrs["ep_meta"] = h5py.Empty("f4")
+        file["data/note"] = np.arange(3)
+    assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)) == 2
+    read = []
+    monkeypatch.setattr(base, "plain", lambda values: read.append(values))
+    check_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    assert read == []
+    for changes, message in (
+        ({"depth": "obs/camera"}, r"depth: has the shape \[1048576, 1048576\], needed"),
+        ({"success": "obs/nothing"}, "success has 0 rows, and there are 3 actions"),
+        ({"reward": "obs/state"}, r"reward: has the shape \[2\], needed one number"),
+        ({"instruction": "ep_meta/lang"}, "instruction: there is no 'ep_meta/lang'"),
+    ):
+        with pytest.raises(ConfigError, match=f"episode 0: {message}"):
+            check_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, **changes})
+
+
+def test_actions_beyond_their_bounds_by_rounding_are_clipped(tmp_path):
+    actions = np.full((3, 5), [1.00001, -1.00001, 0.5, 0, 0])
+    path = foreign(tmp_path / "a.hdf5", actions=actions)
+    first, _ = load_demonstrations(
+        path, task=TASK, env=ENV, mapping={**FOREIGN, "action": "actions"}
+    )
+    assert first["action"][0].tolist() == [1, -1, 0.5, 0, 0]
+
+
+def test_flags_without_an_axis_of_components_fit(tmp_path):
+    path = foreign(tmp_path / "a.hdf5", grip=np.array([1, 0, 1]))
+    first, _ = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "holding": "grip"})
+    assert first["holding"].tolist() == [[True], [False], [True]]
+
+
+@pytest.mark.parametrize(
+    "names", [("ends", "cuts"), ("ends",), ("cuts",), ("ends", "cuts", "wins"), ("wins",)]
+)
+def test_an_episode_whose_file_marks_no_end_is_truncated(names, tmp_path):
+    path = foreign(tmp_path / "a.hdf5", ends=np.zeros(3), cuts=np.zeros((3, 1)), wins=np.zeros(3))
+    keys = {"ends": "terminated", "cuts": "truncated", "wins": "success"}
+    mapping = {**FOREIGN, **{keys[name]: name for name in names}}
+    first, _ = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    is_truncated = "wins" in names  # else the success of the last step terminates
+    last = first["next"][-1]
+    assert (last["truncated"].item(), last["terminated"].item()) == (is_truncated, not is_truncated)
+    assert first["next", "done"].flatten().tolist() == [False, False, True]
+
+
+@pytest.mark.parametrize("key", ["reward", "success", "terminated", "truncated"])
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ([0, np.nan, 1], "no finite numbers"),
+        ([0, np.inf, 1], "no finite numbers"),
+        ([[0, 1]] * 3, r"has the shape \[2\], .*; set components"),
+        (np.array([b"no", b"no", b"yes"]), "no finite numbers; .*set components"),
+    ],
+)
+def test_results_that_are_not_one_number_are_refused_by_name(key, values, message, tmp_path):
+    path = foreign(tmp_path / "a.hdf5", won=np.array(values))
+    with pytest.raises(ConfigError, match=rf"a\.hdf5, episode 0: {key}: .*{message}"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, key: "won"})
+
+
+def test_files_beside_an_export_are_left_alone(episodes, tmp_path):
+    others = [tmp_path / "picking.json", tmp_path / "picking.md"]
+    for file in others:
+        file.write_text("mine")
+    path = exported(tmp_path, episodes, "hdf5")
+    assert [file.read_text() for file in others] == ["mine", "mine"]
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
+    with pytest.raises(ConfigError, match=r"picking could not be read back; end .* in \.hdf5"):
+        export_demonstrations(
+            tmp_path / "picking", episodes, format="hdf5", task=TASK, env=ENV, seed=0
+        )
+    assert not (tmp_path / "picking").exists()
+
+
+def test_cards_of_others_are_not_read(tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    card = tmp_path / "a.hdf5.card.json"
+    for text in ("[]", "{}", '{"format": "theirs"}'):
+        card.write_text(text)
+        with pytest.raises(ConfigError, match="written by another program"):
+            load_demonstrations(path, task=TASK, env=ENV)
+    for text in ("no JSON", '{"format": "hdf5", "entries": {}, "card_format": 3}'):
+        card.write_text(text)
+        with pytest.raises(ConfigError, match="is damaged"):
+            load_demonstrations(path, task=TASK, env=ENV)
+        assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)) == 2
+
+
+@pytest.mark.parametrize("text", [["pick ü"] * 3, np.array([b"pick"] * 3), "pick"])
+def test_instructions_of_any_kind_of_text_are_read(text, tmp_path):
+    path = tmp_path / "a.hdf5"
+    foreign(path)
+    with h5py.File(path, "a") as file:
+        for demo in file["data"].values():
+            demo["lang"] = text
+    with pytest.raises(ConfigError, match=r"It holds .*lang \[\]"):
+        load_demonstrations(path, task=TASK, env=ENV)
+    mapping = {**FOREIGN, "instruction": "lang"}
+    found = load_demonstrations(path, task=TASK, env=ENV, mapping=mapping)
+    wanted = "pick ü" if isinstance(text, list) else "pick"
+    assert found[0]["instruction"] == [wanted] * 3
+
+
+def test_dense_rewards_are_not_made_up(tmp_path):
+    path = foreign(tmp_path / "a.hdf5", progress=np.array([0.1, 0.2, 1.0]), over=np.zeros(3))
+    options = {"task": TASK, "env": {**ENV, "reward": "dense"}}
+    with pytest.raises(ConfigError, match="the mapping has no reward, terminated"):
+        load_demonstrations(path, mapping=FOREIGN, **options)
+    results = {"reward": "progress", "terminated": "over"}
+    found = load_demonstrations(path, mapping={**FOREIGN, **results}, **options)[0]["next"]
+    assert found["reward"].flatten().tolist() == pytest.approx([0.1, 0.2, 1.0])
+    assert found["truncated"].flatten().tolist() == [False, False, True]
+
+
+def test_episodes_that_differ_are_not_exported(episodes, tmp_path):
+    with pytest.raises(
+        ConfigError, match=r"episode 0: depth .*\[1, 64, 64\], needed \[1, 128, 128\]"
+    ):
+        exported(tmp_path, episodes, "hdf5", env={})
+    with pytest.raises(ConfigError, match="episode 1 has no steps"):
+        exported(tmp_path, [episodes[0], episodes[1][:0]], "hdf5")
+    odd = [episodes[0], episodes[1].exclude("proprio", ("next", "proprio"))]
+    with pytest.raises(ConfigError, match="episode 1 has no proprio"):
+        exported(tmp_path, odd, "hdf5")
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda card: card["entries"].pop("action"), "is damaged: .*entries lack action"),
+        (lambda card: card["entries"]["depth"].update(dtype="foo"), "depth has the unknown type"),
+        (lambda card: card["entries"]["depth"].update(dtype="O"), "depth has the unknown type"),
+        (lambda card: card.update(seed="x"), "is damaged: seed: "),
+        (lambda card: card.update(card_format=2), "is of another version; export .* again"),
+        (lambda card: card.update(task_version=7), "task_version: collected with 7, needed "),
+        (lambda card: card.update(episodes=7), "holds 3 episodes, its card says 7"),
+        (lambda card: card["entries"]["proprio"].update(name="no"), "episode 0: .* no 'no', which"),
+    ],
+)
+def test_a_card_that_does_not_fit_its_file_is_refused(damage, message, episodes, tmp_path):
+    path = exported(tmp_path, episodes, "hdf5")
+    file = path.with_name(f"{path.name}.card.json")
+    card = json.loads(file.read_text())
+    damage(card)
+    file.write_text(json.dumps(card))
+    with pytest.raises(ConfigError, match=message):
+        load_demonstrations(path, task=TASK, env=ENV)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("hdf5", "picking.hdf5", "picking.hdf5 was altered: .* delete 'checksums' in .*card.json"),
+        ("zarr", "picking.zarr/data/reward/0.0", "reward/0.0 was altered"),
+        (
+            "zarr",
+            "picking.zarr/last_observations.safetensors",
+            "observations.safetensors is missing",
+        ),
+        ("minari", "picking-v0/data/main_data.hdf5", "main_data.hdf5 is missing"),
+    ],
+)
+def test_an_export_that_was_altered_is_refused(name, damage, message, collected, tmp_path):
+    path = exported(tmp_path, collected, name)
+    file = tmp_path / damage
+    content = file.read_bytes()
+    file.unlink()
+    if "altered" in message:
+        file.write_bytes(content[:-1] + bytes([content[-1] ^ 1]))
+    for read in (check_demonstrations, load_demonstrations):
+        with pytest.raises(DamagedFilesError, match=message):
+            read(path, task=TASK, env=ENV)
+
+
+def zarr_group(path, version=2):
+    """Return a new group in a folder, of a version of the format."""
+    if version == 2 and zarr.__version__.startswith("2."):
+        return zarr.open_group(str(path), mode="w")
+    return zarr.open_group(str(path), mode="w", zarr_format=version)
+
+
+def foreign_zarr(path, version=2, **changes):
+    """Write two episodes of 3 and 2 steps, every chunk of them."""
+    rng = np.random.default_rng(0)
+    arrays = {
+        "data/camera/depth": rng.uniform(0.1, 0.2, (5, SIZE, SIZE)).astype(np.float32),
+        "data/state": np.linspace(0, 1, 10).reshape(5, 2),
+        "data/action": rng.uniform(-1, 1, (5, 5)),
+        "data/success": np.array([0, 0, 1, 0, 0]),
+        "meta/episode_ends": np.array([3, 5]),
+        **changes,
+    }
+    root = zarr_group(path, version)
+    for name, rows in arrays.items():
+        options = {"shape": rows.shape, "dtype": rows.dtype, "chunks": (2, *rows.shape[1:])}
+        if hasattr(root, "create_array"):
+            array = root.create_array(name, **options, config={"write_empty_chunks": True})
+        else:
+            array = root.create_dataset(name, **options)
+        array[:] = rows
+    return path
+
+
+ZARR = {
+    "depth": "camera/depth",
+    "holding": {"source": "state", "components": [1]},
+    "action": "action",
+    "success": "success",
+}
+
+
+def zipped(folder):
+    archive = folder.with_name(f"{folder.name}.zip")
+    with zipfile.ZipFile(archive, "w") as file:
+        for path in filter(Path.is_file, folder.rglob("*")):
+            file.write(path, path.relative_to(folder))
+    return archive
+
+
+needs_zarr_3 = pytest.mark.skipif(zarr.__version__.startswith("2."), reason="zarr 3")
+VERSIONS = [2, pytest.param(3, marks=needs_zarr_3)]
+
+
+@pytest.mark.parametrize("is_zip", [False, True])
+@pytest.mark.parametrize("version", VERSIONS)
+def test_groups_and_archives_of_zarr_are_read(version, is_zip, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", version, **{"data/note": np.arange(7)})
+    depth = zarr.open_group(str(path), mode="r")["data/camera/depth"][:]
+    path = zipped(path) if is_zip else path
+    check_demonstrations(path, task=TASK, env=ENV, least=2, mapping=ZARR)
+    first, second = load_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)
+    np.testing.assert_array_equal(first["depth"][:, 0], depth[:3])
+    np.testing.assert_array_equal(second["depth"][:, 0], depth[3:])
+    assert first["next", "success"].flatten().tolist() == [False, False, True]
+    assert not second["next", "success"].any()
+    with pytest.raises(ConfigError, match=r"data/note has the shape \[7\], the episodes end at"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping={**ZARR, "reward": "note"})
+
+
+@pytest.mark.parametrize("is_zip", [False, True])
+@pytest.mark.parametrize("version", VERSIONS)
+@pytest.mark.parametrize("name", ["data/camera/depth", "data/action", "data/success"])
+def test_a_missing_chunk_of_zarr_is_refused(name, version, is_zip, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", version)
+    chunks = sorted(
+        file for file in (path / name).rglob("*") if file.name[0].isdecimal() and file.is_file()
+    )
+    chunks[-1].unlink()
+    mapped = zipped(path) if is_zip else path
+    for read in (check_demonstrations, load_demonstrations):
+        with pytest.raises(ConfigError, match=rf"1 of 3 chunks of {name} are missing, .*Copy"):
+            read(mapped, task=TASK, env=ENV, mapping=ZARR)
+    if name == "data/success":
+        others = {key: source for key, source in ZARR.items() if key != "success"}
+        assert len(load_demonstrations(mapped, task=TASK, env=ENV, mapping=others)) == 2
+
+
+@pytest.mark.parametrize("version", VERSIONS)
+def test_chunks_that_were_left_out_are_written_as_the_message_says(version, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", version)
+    for chunk in [file for file in (path / "data/success").rglob("*") if file.name in "02"]:
+        chunk.unlink()  # zeros
+    options = {"task": TASK, "env": ENV, "mapping": ZARR}
+    with pytest.raises(ConfigError, match="2 of 3 chunks of data/success") as error:
+        load_demonstrations(path, **options)
+    unset = {"array.write_empty_chunks": False}
+    with zarr.config.set(unset) if hasattr(zarr, "config") else nullcontext():
+        exec(str(error.value).split("write them: ")[1], {"zarr": zarr, "FOLDER": str(path)})
+    assert len(load_demonstrations(path, **options)) == 2
+
+
+def test_a_zarr_folder_without_its_ends_is_refused(tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr")
+    options = {"task": TASK, "env": ENV, "mapping": ZARR}
+    for ends, message in (([3, 4], r"has the shape \[5.*end at \[4\]"), ([3, 3], "do not rise")):
+        zarr.open(str(path), mode="a")["meta/episode_ends"][:] = ends
+        with pytest.raises(ConfigError, match=message):
+            load_demonstrations(path, **options)
+    (path / "meta/episode_ends/0").unlink()
+    with pytest.raises(ConfigError, match="1 of 1 chunks of meta/episode_ends are missing"):
+        load_demonstrations(path, **options)
+
+
+def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_path):
+    plain = [each.exclude("instruction", ("next", "instruction")) for each in episodes]
+    card = read_card(exported(tmp_path, plain, "hdf5"))
+    assert card.instructions == [card.prompt] == [ba_torchrl.describe(TASK).instruction]
+    assert card.model_copy(update={"instructions": []}).prompt == card.goal
+
+
+def test_lerobot_gets_the_prompt_of_its_environment(episodes, tmp_path):
+    datasets = pytest.importorskip("lerobot.datasets.lerobot_dataset")
+    plain = [each.exclude("instruction", ("next", "instruction")) for each in episodes]
+    path = exported(tmp_path, plain, "lerobot")
+    dataset = datasets.LeRobotDataset("a/b", root=path, video_backend="pyav")
+    assert dataset[0]["task"] == ba_torchrl.describe(TASK).instruction
+
+
+def test_only_folders_of_ours_are_read_for_an_export(tmp_path):
+    for path in (foreign(tmp_path / "a.hdf5"), tmp_path):
+        with pytest.raises(ConfigError, match="folders of `ba-torchrl collect` or `play`"):
+            read_demonstrations(path)
+
+
+@pytest.mark.parametrize("lost", ["obs/depth", "actions"])
+def test_rows_that_are_missing_are_named(lost, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        rows = file[f"data/demo_1/{lost}"][:-1]
+        del file[f"data/demo_1/{lost}"]
+        file[f"data/demo_1/{lost}"] = rows[:0] if lost == "actions" else rows
+    with pytest.raises(ConfigError, match=r"episode 1: .* rows, and there are [02] actions"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        for name in ("obs/depth", "obs/state", "actions"):
+            rows = file[f"data/demo_1/{name}"][:0]
+            del file[f"data/demo_1/{name}"]
+            file[f"data/demo_1/{name}"] = rows
+    with pytest.raises(ConfigError, match="episode 1: there are no actions"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    with h5py.File(path, "a") as file:
+        del file["data"]
+        file.create_group("data")
+    with pytest.raises(ConfigError, match="holds no episodes"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+
+
+def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    with pytest.raises(ConfigError, match=r"demonstrations_mapping\). It holds actions \[5\], obs"):
+        load_demonstrations(path, task=TASK, env=ENV)
+    save_demonstrations(tmp_path / "ours", collected, task=TASK, env=ENV, seed=0)
+    with pytest.raises(ConfigError, match="has our entries; leave out the mapping"):
+        load_demonstrations(tmp_path / "ours", task=TASK, env=ENV, mapping=FOREIGN)
+    (tmp_path / "b.yaml").write_text("- a\n- b\n")
+    with pytest.raises(ConfigError, match=r"b\.yaml: must map keys to names"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "b.yaml")
+    (tmp_path / "d.yaml").write_text("depth: [1,\naction: b\n")
+    with pytest.raises(ConfigError, match=r"d\.yaml: .* line 3"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "d.yaml")
+    with pytest.raises(ConfigError, match=r"no demonstrations at .*in the formats"):
+        load_demonstrations(tmp_path / "none.hdf5", task=TASK, env=ENV, mapping=FOREIGN)
+    (tmp_path / "c.hdf5").write_text("no HDF5")
+    with pytest.raises(ConfigError, match=r"c\.hdf5 cannot be read: OSError"):
+        load_demonstrations(tmp_path / "c.hdf5", task=TASK, env=ENV, mapping=FOREIGN)
+
+
+@pytest.mark.parametrize(
+    "pickled",
+    [
+        {"dtype": "|O", "filters": [{"id": "pickle"}]},
+        {"filters": [{"id": "pickle"}]},
+        {"compressor": {"id": "pickle"}},
+    ],
+)
+def test_pickles_in_zarr_are_refused(pickled, tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr")
+    array = {"shape": [5], "chunks": [5], "dtype": "<f4", "filters": None, "compressor": None}
+    array |= {"fill_value": None, "order": "C", "zarr_format": 2, **pickled}
+    (path / "data/note").mkdir()
+    (path / "data/note/.zarray").write_text(json.dumps(array))
+    (path / "data/note/0").write_bytes(pickle.dumps(Exploding()))
+    options = {"task": TASK, "env": ENV}
+    assert len(load_demonstrations(path, mapping=ZARR, **options)) == 2
+    for read in (check_demonstrations, load_demonstrations):
+        with pytest.raises(ConfigError, match=r"note is not opened|No Zarr data type"):
+            read(path, mapping={**ZARR, "reward": "note"}, **options)
+
+
+class Exploding:
+    def __reduce__(self):
+        return pytest.exit, ("a pickle was loaded",)
+
+
+@pytest.mark.parametrize("name", ["hdf5", "zarr", "minari", "lerobot"])
+def test_a_missing_package_is_named(name, collected, tmp_path, monkeypatch):
+    for module in ("h5py", "zarr", "minari", "lerobot.datasets.lerobot_dataset"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(MissingPackageError, match=f"pip install .*{FORMATS[name].package}"):
+        exported(tmp_path, collected, name)
+
+
+def test_a_format_from_outside_the_package(episodes, tmp_path, monkeypatch):
+    class Npz(Format):
+        """One archive of NumPy."""
+
+        package = "numpy"
+
+        def matches(self, path):
+            return path.suffix == ".npz"
+
+        def names(self, entries):
+            return {key: key.upper() for key in entries}
+
+        def write(self, path, episodes, card):
+            flat = {f"{i} {k}": v for i, each in enumerate(episodes) for k, v in each.items()}
+            np.savez(path, **flat)
+
+        def read(self, path):
+            found = {}
+            for name, rows in np.load(path).items():
+                found.setdefault(int(name.split()[0]), {})[name.split()[1]] = rows
+            return list(found.values())
+
+    monkeypatch.setattr(FORMATS, "_entries", {**FORMATS._entries})
+    FORMATS.register("npz")(Npz())
+    options = {"task": TASK, "env": ENV}
+    export_demonstrations(tmp_path / "a.npz", episodes, format="npz", seed=0, **options)
+    assert_equal(load_demonstrations(tmp_path / "a.npz", **options), episodes)
+    with pytest.raises(UnknownNameError, match="Did you mean 'npz'"):
+        export_demonstrations(tmp_path / "b", episodes, format="npy", seed=0, **options)
