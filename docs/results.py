@@ -1,16 +1,19 @@
-"""Write results.md and its curves from the package's records.
+"""Write results.md and its figures from the records.
 
 python -m docs.results                        # the page
-python -m docs.results runs/cpu_close_loop    # add the records of these runs first
+python -m docs.results runs/equivariance      # add the records of these runs first
 
-A record is the `result.json` of a finished run, or the test of a policy (`docs.shipped`), in
-ba_torchrl/results.
+A record is the `result.json` of a finished run, or the test of a policy (`docs.shipped`). Those of
+a benchmark that answers a question are in docs/results/BENCHMARK, all others in the package.
 """
 
 from __future__ import annotations
 
+import math
+import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 
 from ba_torchrl.commands.report import completed
 from ba_torchrl.core.files import write_text
@@ -22,9 +25,18 @@ from ba_torchrl.record.leaderboard import (
     cell_text,
     leaderboard,
     package_runs,
+    read_records,
 )
 from ba_torchrl.record.report import pipes, plot_groups
-from ba_torchrl.record.summary import Group, Run, load_runs
+from ba_torchrl.record.summary import (
+    GOOD_RATE,
+    Group,
+    Run,
+    Section,
+    compare,
+    grouped,
+    load_runs,
+)
 from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.protocol import PROTOCOL
@@ -32,41 +44,35 @@ from docs.sources import ROOT
 
 PAGE = ROOT / "docs" / "results.md"
 FOLDER = ROOT / "docs" / "results"
-BEGIN, END = "<!-- results: begin -->\n", "<!-- results: end -->\n"
-HEADER = (
-    "task",
-    "",
-    "expert",
-    "method",
-    "success",
-    "best",
-    "steps",
-    "demonstrations",
-    "environment steps",
-    "minutes",
-    "processors",
-    "commit",
-)
+ALL_TASKS = "results"
+"""Marker of the tables of all tasks in the page; those of questions are their benchmarks' names."""
+MARKED = re.compile(r"(<!-- (\w+): begin -->\n).*?(<!-- \2: end -->\n)", re.DOTALL)
+HEADER = ("task", "expert", "method", "success", "steps", "environment steps", "minutes")
+COMPARED = ("task", "method", "success", "area", f"environment steps to {GOOD_RATE}", "minutes")
+DIFFERENCES = ("task", "first", "second", "seeds", "first - second", "95 % interval", "")
 
 
 def add(roots: Sequence[str]) -> int:
-    """Write the records of the finished runs below some folders into the package.
+    """Write the records of the finished runs below some folders to their places.
 
     Returns:
         Their number.
 
     Raises:
-        ValueError: runs have the same task, label and seed, and with them the same file.
+        ValueError: runs have the same benchmark, task, label and seed, and with them the same file.
     """
-    named: dict[str, Run] = {}
+    named: dict[Path, Run] = {}
     for run in load_runs(roots)[0]:
-        name = f"{run.result.task} {run.result.label} seed{run.result.seed}"
+        result = run.result
+        name = f"{result.task} {result.label} seed{result.seed}"
         name = "".join(c if c.isalnum() or c in "-." else "_" for c in name) + ".json"
-        if name in named:
-            raise ValueError(f"{named[name].folder} and {run.folder} are both {name}")
-        named[name] = run
-    for name, run in named.items():
-        write_text(RECORDS / name, run.result.model_dump_json() + "\n")
+        answers = result.benchmark is not None and (FOLDER / result.benchmark).is_dir()
+        path = (FOLDER / result.benchmark if answers else RECORDS) / name
+        if path in named:
+            raise ValueError(f"{named[path].folder} and {run.folder} are both {name}")
+        named[path] = run
+    for path, run in named.items():
+        write_text(path, run.result.model_dump_json() + "\n")
     return len(named)
 
 
@@ -76,68 +82,97 @@ def present() -> Leaderboard:
     return leaderboard(package_runs(completed), [], tasks, PROTOCOL)
 
 
-def page_with_results(text: str) -> str:
-    """Return the page with tables of the present records."""
-    start, end = text.index(BEGIN) + len(BEGIN), text.index(END)
-    board = present()
-    header, *rows = board.rows()
-    parts = [f"{LEGEND}\n", *pipes(header, ([f"`{task}`", *cells] for task, *cells in rows)), ""]
-    if board.left_out:
-        parts += ["Left out:", "", *(f"- {run}" for run in board.left_out), ""]
-    for heading, groups in _by_heading(board).items():
-        parts += _section(heading, groups)
-    return text[:start] + "\n" + "\n".join(parts) + "\n" + text[end:]
-
-
-def _by_heading(board: Leaderboard) -> dict[str, list[Group]]:
-    """Return the rows of each group of tasks that has one."""
-    found = {
-        heading: [
-            board.cells[task, method]
-            for task in tasks
-            for method in board.methods
-            if (task, method) in board.cells
-        ]
-        for heading, tasks in tasks_by_heading(board.tasks).items()
+def questions() -> dict[str, Section]:
+    """Return the records of each benchmark that answers a question, by its name."""
+    return {
+        folder.name: Section(folder.name, grouped(read_records(folder, completed)))
+        for folder in sorted(FOLDER.iterdir())
+        if folder.is_dir()
     }
-    return {heading: groups for heading, groups in found.items() if groups}
 
 
-def _figure(heading: str) -> str:
-    """Return the name of the figure of a group of tasks."""
-    return heading.split(":")[0].lower().replace(" ", "_") + ".svg"
+def page_with_results(text: str) -> str:
+    """Return the page with tables of the present records between its markers.
+
+    Raises:
+        KeyError: there are no records of a marker's name.
+    """
+    texts = {name: "\n".join(_question(section)) for name, section in questions().items()}
+    texts[ALL_TASKS] = "\n".join(_all_tasks(present()))
+    return MARKED.sub(lambda found: f"{found[1]}\n{texts[found[2]]}\n{found[3]}", text)
 
 
-def _section(heading: str, groups: Sequence[Group]) -> Iterator[str]:
-    yield f"## {heading}\n"
-    if any(_has_curve(group) for group in groups):
-        yield f"![Success over environment steps](results/{_figure(heading)})\n"
-    yield from pipes(HEADER, map(_cells, groups))
+def _question(section: Section) -> Iterator[str]:
+    """Yield the lines of the answer to a question."""
+    yield f"![Success over environment steps](results/{section.title}.svg)\n"
+    ends = {
+        task: max(group.env_steps for group in section.groups if group.task == task)
+        for task in section.tasks
+    }
+    yield from pipes(COMPARED, (_compared_cells(each, ends[each.task]) for each in section.groups))
     yield ""
+    yield from pipes(DIFFERENCES, (_difference(row) for row in compare(section)))
+    yield ""
+    yield _origin([run for group in section.groups for run in group.runs])
 
 
-def _has_curve(group: Group) -> bool:
-    return any(run.result.curve for run in group.runs)
-
-
-def _cells(group: Group) -> list[str]:
-    """Return the row of a task and a method; numbers of several runs are means."""
-    results, task = [run.result for run in group.runs], group.task
-    score = describe(task).experts.get(results[0].config["env"]["robot"])
+def _compared_cells(group: Group, end: int) -> list[str]:
+    steps = group.reaches(GOOD_RATE)[1]
     return [
-        f"`{task}`",
-        f'<img src="gallery/{task.replace("/", "_")}.png" width="160">',
-        "" if score is None else f"{score.success_rate:.2f}",
+        f"`{group.task}`",
         group.method,
         cell_text(group),
-        _mean([result.best.success_rate for result in results], ".2f"),
-        _mean([result.last.mean_length for result in results], ".1f"),
-        _mean([result.demonstrations for result in results]),
-        _mean([result.env_steps for result in results]),
-        _mean([result.seconds and result.seconds / 60 for result in results]),
-        ", ".join(sorted({result.hardware["gpu"] or result.hardware["cpu"] for result in results})),
-        ", ".join(sorted({result.versions.get("commit", "") for result in results})),
+        f"{group.area(end):.2f}",
+        "–" if math.isnan(steps) else f"{steps:.0f}",
+        _mean([run.result.seconds and run.result.seconds / 60 for run in group.runs]),
     ]
+
+
+def _difference(row: Mapping[str, object]) -> list[str]:
+    interval = f"{row['low']:+.2f} to {row['high']:+.2f}"
+    names = (f"`{row['task']}`", row["first"], row["second"], row["seeds"])
+    return [*map(str, names), f"{row['difference']:+.2f}", interval, str(row["reading"])]
+
+
+def _all_tasks(board: Leaderboard) -> Iterator[str]:
+    """Yield the lines of the tables of all tasks."""
+    yield f"{LEGEND}\n"
+    if board.left_out:
+        yield from ("Left out:", "", *(f"- {run}" for run in board.left_out), "")
+    for heading, tasks in tasks_by_heading(board.tasks).items():
+        yield f"### {heading}\n"
+        yield from pipes(HEADER, (row for task in tasks for row in _rows(board, task)))
+        yield ""
+    if board.cells:
+        yield _origin([run for group in board.cells.values() for run in group.runs])
+
+
+def _rows(board: Leaderboard, task: str) -> Iterator[list[str]]:
+    """Yield the rows of a task; numbers of several runs are means."""
+    robot = "kuka"
+    groups = [group for (of, _), group in board.cells.items() if of == task]
+    if not groups:
+        score = describe(task).experts.get(robot)
+        yield [f"`{task}`", f"{score.success_rate:.2f}" if score else "", *["–"] * 5]
+    for group in groups:
+        results = [run.result for run in group.runs]
+        score = describe(task).experts.get(results[0].config["env"]["robot"])
+        yield [
+            f"`{task}`",
+            f"{score.success_rate:.2f}" if score else "",
+            group.method,
+            cell_text(group),
+            _mean([result.last.mean_length for result in results], ".1f"),
+            _mean([result.env_steps for result in results]),
+            _mean([result.seconds and result.seconds / 60 for result in results]),
+        ]
+
+
+def _origin(runs: Sequence[Run]) -> str:
+    """Return the processors and commits of runs, in one line."""
+    processors = sorted({r.result.hardware["gpu"] or r.result.hardware["cpu"] for r in runs})
+    commits = sorted({run.result.versions.get("commit", "unknown") for run in runs})
+    return f"Processors: {', '.join(processors)}; commits: {', '.join(commits)}.\n"
 
 
 def _mean(values: Sequence[float | None], form: str = ".0f") -> str:
@@ -147,13 +182,11 @@ def _mean(values: Sequence[float | None], form: str = ".0f") -> str:
 
 
 def main() -> None:
-    """Add records, and write the page and its curves."""
+    """Add records, and write the page and its figures."""
     if sys.argv[1:]:
         print(f"{add(sys.argv[1:])} records added")
-    for heading, groups in _by_heading(present()).items():
-        if any(_has_curve(group) for group in groups):
-            with_curve = [group for group in groups if _has_curve(group)]
-            plot_groups(with_curve, [FOLDER / _figure(heading)])
+    for name, section in questions().items():
+        plot_groups(section.groups, [FOLDER / f"{name}.svg"])
     PAGE.write_text(page_with_results(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 

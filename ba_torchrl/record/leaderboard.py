@@ -51,9 +51,14 @@ def cell_text(group: Group) -> str:
 
 def package_runs(completed: Completed = lambda run: run) -> list[Run]:
     """Read the package's records."""
+    return read_records(RECORDS, completed)
+
+
+def read_records(folder: Path, completed: Completed = lambda run: run) -> list[Run]:
+    """Read the records in a folder, a JSON file each."""
     return [
         Run(path, completed(RunResult.model_validate_json(json_bytes(path))))
-        for path in sorted(RECORDS.glob("*.json"))
+        for path in sorted(folder.glob("*.json"))
     ]
 
 

@@ -15,7 +15,8 @@ from ba_torchrl.tasks.base import TASKS
 from docs import results as page
 from tests.record.test_report import PICK, REACH, policy_test, write_run
 
-NO_RECORDS = "<!-- results: begin -->\nold\n<!-- results: end -->\nend"
+ALL_TASKS = "<!-- results: begin -->\nold\n<!-- results: end -->\nend"
+QUESTION = "<!-- mine: begin -->\nold\n<!-- mine: end -->\nend"
 
 
 def make_run(folder, rate=0.9, **changes):
@@ -26,7 +27,7 @@ def make_run(folder, rate=0.9, **changes):
         "task_version": TASKS[REACH].version,
         "last": policy_test(rate, episodes=200),
     } | values
-    write_run(folder, (0.1, 0.5, rate), benchmark=None, **values)
+    write_run(folder, (0.1, 0.5, rate), **{"benchmark": None, **values})
     return Run(folder, read_result(folder))
 
 
@@ -37,6 +38,8 @@ def records(tmp_path, monkeypatch):
     folder.mkdir()
     monkeypatch.setattr(boards, "RECORDS", folder)
     monkeypatch.setattr(page, "RECORDS", folder)
+    monkeypatch.setattr(page, "FOLDER", tmp_path / "questions")
+    (tmp_path / "questions/mine").mkdir(parents=True)
     return folder
 
 
@@ -110,7 +113,7 @@ def test_the_command_prints_the_table(tmp_path, capsys):
 
 def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
     tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
-    assert len(re.findall(r"^\| `", page.page_with_results(NO_RECORDS), flags=re.MULTILINE)) == len(
+    assert len(re.findall(r"^\| `", page.page_with_results(ALL_TASKS), flags=re.MULTILINE)) == len(
         tasks
     )
     for seed in range(2):
@@ -127,11 +130,27 @@ def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
         "close_loop_block_reaching_sacfd_equi_seed1.json",
         "trained.json",
     ]
-    text = page.page_with_results(NO_RECORDS)
-    assert "| sacfd equi (policy from a file) | sacfd equi (policy of a run) |" in text
-    assert "results/close_loop.svg" in text
-    assert "## Open loop" not in text
-    (row,) = re.findall(rf"^\| `{REACH}` \| <img.*", text, flags=re.MULTILINE)
-    assert "2×200* | 0.90 | 6.0 | 5 | 1500 | 33 | Some CPU | abc |" in row
-    (row,) = re.findall(rf"^\| `{PICK}` \| <img.*", text, flags=re.MULTILINE)
-    assert "1×200* | 0.90 | 6.0 | 5 | – | – | Some CPU | abc |" in row
+    text = page.page_with_results(ALL_TASKS)
+    rows = re.findall(r"^\| `close_loop/block_(?:reaching|picking)` .*", text, flags=re.MULTILINE)
+    assert [row.split(" | ")[2:] for row in rows] == [
+        ["sacfd equi (policy from a file)", "0.90 (0.85 to 0.93) 1×200*", "6.0", "–", "– |"],
+        ["sacfd equi (policy of a run)", rows[1].split(" | ")[3], "6.0", "1500", "33 |"],
+    ]
+    assert "2×200*" in rows[1]
+    assert "Processors: Some CPU; commits: abc." in text
+
+
+def test_the_records_of_a_question_are_compared(tmp_path, records):
+    for seed in range(2):
+        for rate, label in ((0.9, "first"), (0.4, "second")):
+            name = f"runs/{label}{seed}"
+            make_run(tmp_path / name, rate, seed=seed, label=label, benchmark="mine")
+    assert page.add([str(tmp_path / "runs")]) == 4
+    assert not list(records.iterdir())
+    text = page.page_with_results(QUESTION)
+    assert "results/mine.svg" in text
+    first, second, difference = re.findall(rf"^\| `{REACH}` .*", text, flags=re.MULTILINE)
+    assert [row.split(" | ")[1] for row in (first, second)] == ["first", "second"]
+    assert first.split(" | ")[3] > second.split(" | ")[3]
+    assert difference.split(" | ")[1:5] == ["first", "second", "2", "+0.50"]
+    assert difference.endswith("direction only |")
