@@ -135,7 +135,7 @@ def test_vector_specs_of_worker_processes(task):
 
 @pytest.mark.parametrize(
     ("task", "robot"),
-    zip(["close_loop/house_building", BIN, "ramp/block_stacking"], OTHER_ROBOTS, strict=True),
+    [*zip(["close_loop/house_building", BIN, "ramp/block_stacking"], OTHER_ROBOTS, strict=True)],
 )
 def test_an_episode_of_another_robot_starts_valid_and_unsolved(task, robot):
     checks.check_resets(task, robot=robot, episodes=3)

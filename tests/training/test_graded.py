@@ -6,7 +6,6 @@ from types import SimpleNamespace
 
 import pytest
 import torch
-from tests.data.test_formats import assert_equal
 
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.commands import collect
@@ -17,6 +16,7 @@ from ba_torchrl.demonstrations.demo_files import read_metadata
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import graded
 from ba_torchrl.training.graded import GRADES, GradedSets
+from tests.demonstrations.test_formats import assert_equal
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 
