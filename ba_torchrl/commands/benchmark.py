@@ -5,7 +5,7 @@ ba-torchrl benchmark benchmark=close_loop_4d dry_run=true       # list the state
 ba-torchrl benchmark 'tasks=[close_loop/block_picking]' 'networks=[cnn]' total_updates=600 \
     env.obs_size=64 network.width=0.5 folder=runs/small
 ba-torchrl benchmark benchmark=close_loop_4d launcher=ray launcher.cpus=4
-ba-torchrl benchmark benchmark=close_loop_4d launcher=submitit launcher.options.partition=gpu
+ba-torchrl benchmark benchmark=close_loop_4d only=$SLURM_ARRAY_TASK_ID
 """
 
 from __future__ import annotations
@@ -34,24 +34,22 @@ class Settings(BenchmarkConfig):
     dry_run: bool = False
     """List the runs and their states."""
     only: int | None = Field(default=None, ge=0)
-    """Number of the only run to start, from 0 on; the jobs of launcher=submitit set it."""
+    """Number of the only run to start, from 0 on, in the order of ``dry_run``."""
 
 
 @dataclass(frozen=True)
 class Task:
-    """A grid, its runs, and the words of the command line."""
+    """A grid and its runs."""
 
     settings: Settings
     runs: list[ExperimentConfig]
-    words: list[str]
 
 
-def parse(values: dict[str, Any], arguments: Arguments) -> Task:
+def parse(values: dict[str, Any], _: Arguments) -> Task:
     """Return the grid with its runs, all of them checked.
 
     Args:
         values: of all settings: those of `Settings`, and fields of `ExperimentConfig`.
-        arguments: the command line.
     """
     settings, common = split(values, Settings)
     if not settings.dry_run:
@@ -59,7 +57,7 @@ def parse(values: dict[str, Any], arguments: Arguments) -> Task:
     runs = plan(settings, common, hydra_schema.preset)
     if settings.only is not None and settings.only >= len(runs):
         raise ConfigError(f"only: must be a number from 0 to {len(runs) - 1}, got {settings.only}")
-    return Task(settings, runs, arguments.overrides)
+    return Task(settings, runs)
 
 
 def check(values: dict[str, Any]) -> None:
@@ -87,7 +85,7 @@ def main(task: Task) -> None:
     launcher.check(runs)
     # the runs end with this process
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    grid = Grid(runs, Path(config.folder), config.jobs, config.max_hours, task.words)
+    grid = Grid(runs, Path(config.folder), config.jobs, config.max_hours)
     try:
         failures = launcher.run_all(grid)
     except (KeyboardInterrupt, SystemExit):
@@ -101,11 +99,10 @@ def main(task: Task) -> None:
             print(f"  running {folder}: {state.detail}")
     for folder, reason in failures.items():
         print(f"  failed  {folder}: {reason}")
-    if only is not None:
-        return  # one of several jobs, which all end; the failure is recorded
     if failures:
         sys.exit(1)
-    print(f"  next    ba-torchrl report {config.folder}")
+    if only is None:
+        print(f"  next    ba-torchrl report {config.folder}")
 
 
 COMMAND = Command(main, Settings, config="benchmark", parse=parse, check=check)

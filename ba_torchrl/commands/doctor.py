@@ -32,7 +32,7 @@ NEEDED = (
     "pydantic",
     "safetensors",
 )
-OPTIONAL = ("tensorboard", "wandb", "ray", "hydra-submitit-launcher", "stable-baselines3")
+OPTIONAL = ("tensorboard", "wandb", "ray", "stable-baselines3")
 SHARED_MEMORY = "/dev/shm"
 
 

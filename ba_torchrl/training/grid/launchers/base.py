@@ -24,8 +24,6 @@ class Grid:
     """Runs at the same time."""
     max_hours: float | None
     """Time limit of each run."""
-    words: Sequence[str]
-    """Arguments of ``ba-torchrl benchmark`` that give these runs."""
 
 
 class LauncherConfig(StrictModel, ABC):
