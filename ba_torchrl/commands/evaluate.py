@@ -2,7 +2,6 @@
 
 ba-torchrl evaluate runs/my-run episodes=100 video=my-run.mp4
 ba-torchrl evaluate runs/my-run which=latest
-ba-torchrl evaluate runs/my-run expert=true        # close loop: compare the actions
 ba-torchrl evaluate trained task=close_loop/block_picking
 ba-torchrl evaluate trained folder=runs/trained    # all that the package ships; resumable
 """
@@ -32,8 +31,6 @@ from ba_torchrl.record.statistics import wilson
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
-    from tensordict import TensorDict
-
     from ba_torchrl.training.policy import TrainedPolicy
 
 
@@ -60,8 +57,6 @@ class Settings(EpisodeSettings):
     """Of policy=trained; null for all of them."""
     folder: OutputFolder | None = None
     """Of policy=trained: the record of each policy as JSON, whose episodes are not played again."""
-    expert: bool = False
-    """Close loop: compare the policy's actions with the expert's, by component."""
     video: VideoFile | None = None
     """A file such as evaluation.mp4 or evaluation.gif."""
     video_episodes: Count = 5
@@ -78,8 +73,8 @@ def main(settings: Settings) -> None:
         if settings.folder is not None:
             raise ConfigError("folder: it is for policy=trained; leave it out")
         _evaluate(settings.policy, settings)
-    elif settings.folder is not None and (settings.expert or settings.video is not None):
-        raise ConfigError("folder: it keeps success and length; leave out expert and video")
+    elif settings.folder is not None and settings.video is not None:
+        raise ConfigError("folder: it keeps success and length; leave out video")
     elif settings.folder is not None and settings.seed is not None:
         raise ConfigError("folder: it keeps records under the protocol; leave out seed")
     elif settings.task is not None:
@@ -95,8 +90,6 @@ def play(
     policy: TrainedPolicy,
     settings: EpisodeSettings,
     seed: int = FIRST_TEST_SEED,
-    episodes: list[TensorDict] | None = None,
-    expert: bool = False,
 ) -> TestedPolicy:
     """Play greedy episodes in new environments, by default those of the protocol.
 
@@ -104,8 +97,6 @@ def play(
         policy: acts.
         settings: of the episodes.
         seed: of the first.
-        episodes: which they are appended to.
-        expert: add the expert's actions to them.
     """
     from ba_torchrl import make_vector_env
     from ba_torchrl.training.protocol import run_test
@@ -115,34 +106,24 @@ def play(
         settings.num_envs,
         parallel=settings.parallel,
         register_modules=settings.plugins,
-        expert=expert,
     )
-
-    def on_episode(episode: TensorDict) -> None:
-        if episodes is not None:
-            episodes.append(episode)
-        bar.update()
-
     try:
         with progress_bar(total=settings.episodes, unit="episode") as bar:
-            return run_test(env, policy, policy.updates, settings.episodes, on_episode, seed)
+            updates, episodes = policy.updates, settings.episodes
+            return run_test(env, policy, updates, episodes, lambda _: bar.update(), seed)
     finally:
         env.close()
 
 
 def _evaluate(source: str, settings: Settings) -> None:
     from ba_torchrl import load_policy
-    from ba_torchrl.training.agreement import agreement_table, check_comparable
     from ba_torchrl.training.evaluation import record_episodes
     from ba_torchrl.training.protocol import PROTOCOL
 
     policy = load_policy(source, settings.which, settings.device)
-    if settings.expert:
-        check_comparable(policy.task)
     seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
-    episodes: list[TensorDict] = []
     if settings.folder is None:
-        found = play(policy, settings, seed, episodes, settings.expert)
+        found = play(policy, settings, seed)
     else:
         found = _recorded(policy, settings).last
     _, low, high = wilson(found.success_rate, found.episodes)
@@ -167,8 +148,6 @@ def _evaluate(source: str, settings: Settings) -> None:
             f"  episodes  protocol {PROTOCOL}; not citable: fewer than {CITABLE_EPISODES} episodes"
         )
     resolved = policy.config.resolved_env
-    if settings.expert:
-        print(f"\n{agreement_table(episodes, resolved.actions.sequence)}")
     if settings.video is not None:
         frames = record_episodes(resolved, policy, settings.video_episodes, seed)
         print(f"  video     {write_video(settings.video, frames, fps=resolved.video_fps)}")

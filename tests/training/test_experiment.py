@@ -489,11 +489,9 @@ def test_the_recipes_from_collection_to_evaluation(tmp_path, capsys):
         "episodes=3",
         "num_envs=2",
         "parallel=false",
-        "expert=true",
         f"video={gif}",
         "video_episodes=1",
     )
-    assert [line[2] for line in out.splitlines() if "| first |" in line] == list("pxyzr")
     assert "over 3 episodes of close_loop/block_reaching" in out
     assert "not citable: fewer than 200 episodes" in out
     assert f"update 3, {find_checkpoint(tmp_path / 'run')}" in out
