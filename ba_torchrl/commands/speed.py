@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 
 LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn")}
 """Algorithm and usual network by control."""
+WARM_UP_UPDATES = 5
+"""First updates, which are slower than later ones and not measured."""
 
 
 class Settings(EnvSettings):
@@ -57,7 +59,7 @@ def main(settings: Settings) -> None:
     """Print a table, row by row."""
     for task in settings.tasks:
         check_env(task, settings.env)  # before the import of torch
-    from ba_torchrl.training.duration import compute_path
+    from ba_torchrl.training.precision import compute_path
 
     learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
     print(f"{'':52} {'per second':>10}")
@@ -141,7 +143,6 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.training.checkpoint import build_algorithm
-    from ba_torchrl.training.duration import WARM_UP_UPDATES
 
     algorithm = build_algorithm(config)
     env = make_vector_env(config.resolved_env, 1, parallel=False, seed=settings.seed, expert=True)

@@ -18,12 +18,11 @@ from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.core import keys
 from ba_torchrl.demonstrations.episodes import mean_length, success_rate
 from ba_torchrl.record.logging import ScalarLog, progress_bar
-from ba_torchrl.record.results import CurvePoint, TestedPolicy
+from ba_torchrl.record.results import CurvePoint, Phase, TestedPolicy
 from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
 from ba_torchrl.training.collection import gather_demonstrations, make_env, start_collection
 from ba_torchrl.training.collectors.base import Collection
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.duration import PhaseClock, UpdateTimer, compute_path, precision
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.outputs import (
@@ -35,10 +34,15 @@ from ba_torchrl.training.outputs import (
     write_record,
 )
 from ba_torchrl.training.persistence import RunLock
+from ba_torchrl.training.precision import compute_path, precision
 from ba_torchrl.training.protocol import run_test
 from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
 
 logger = logging.getLogger(__name__)
+
+WARM_UP_UPDATES = 5
+"""First updates, which are slower than later ones and not measured."""
+MEASURED_UPDATES = 15
 
 
 class Experiment:
@@ -75,7 +79,8 @@ class Experiment:
         self._eval_env: EnvBase | None = None
         self._progress = Progress()
         self._state = ResumeState(config.folder, self.algorithm, self._progress)
-        self._timer = UpdateTimer()
+        self._update_times: list[float] = []
+        """Seconds of collection and updates after each of the first updates of a phase."""
         self._seconds_per_update: float | None = None
         self._phase_name = ""
         self._signals = StopSignals()
@@ -83,7 +88,7 @@ class Experiment:
         """Whether the state can be saved: there is one, and no update is under way."""
         self._is_reporting = False
         """Whether the networks may be those of an earlier update; the last state is saved then."""
-        self._clock, self._last_save = PhaseClock(), time.perf_counter()
+        self._last_time = self._last_save = time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
     def run(self) -> Result:
@@ -92,7 +97,7 @@ class Experiment:
         Raises:
             RunStopped: SIGINT or SIGTERM was received, and the state is saved.
         """
-        self._clock, self._last_save = PhaseClock(), time.perf_counter()
+        self._last_time = self._last_save = time.perf_counter()
         for message in self.config.without_effect():
             logger.warning(message)
         with self._signals:  # which last until the state is saved
@@ -135,7 +140,6 @@ class Experiment:
         self._is_between_updates = True
         updates, progress = self.algorithm.updates, self._progress
         progress.resumed_at.append(updates)
-        self._clock.add(progress.phase_seconds)
         self._bar.update(updates)
         last = progress.curve[-1] if progress.curve else None
         if last and 0 < last.updates == updates and not self.checkpoints.has(updates):
@@ -151,7 +155,7 @@ class Experiment:
         self._is_between_updates = True
 
     def _store_demonstrations(self) -> None:
-        with self._phase("demonstrations"), self._clock.phase("demonstrations"):
+        with self._phase("demonstrations"), self._timed("demonstrations"):
             episodes = gather_demonstrations(
                 self.config, self.algorithm, lambda _: self._signals.check()
             )
@@ -179,12 +183,12 @@ class Experiment:
                 self._update(algorithm.pretrain_update)
         if self._is_complete:
             return
-        with self._clock.phase("collection"):
+        with self._timed("collection"):
             self._collection = self._start_collection()
-        self._timer.restart()  # collection between updates takes time
+        self._update_times.clear()  # collection between updates takes time
         with self._phase("training"):
             while not self._take_pending_updates():
-                with self._clock.phase("collection"):
+                with self._timed("collection"):
                     steps = self._store(next(self._collection))
                 if algorithm.replay_size >= config.min_replay:
                     self._progress.pending_updates = steps * config.updates_per_step
@@ -235,8 +239,7 @@ class Experiment:
         rates = {"final/success_rate": last.success_rate, "final/mean_length": last.mean_length}
         self.log.write(last.updates, {**rates, "final/best_success_rate": best.success_rate})
         curve = plot_curve(config, progress.curve)
-        progress.phase_seconds = self._clock.seconds()
-        seconds = sum(progress.phase_seconds.values())
+        seconds = self._total_seconds()
         files = {"curve": curve, "checkpoint": latest, "best": best_checkpoint, "video": video}
         record = write_record(config, self.algorithm, last, best, progress, files)
         self._state.remove()
@@ -255,6 +258,25 @@ class Experiment:
         finally:
             self._phase_name = before
             self._bar.set_description(before, refresh=shows)
+
+    @contextmanager
+    def _timed(self, phase: Phase) -> Iterator[None]:
+        """Context whose time is that of a phase; the time between such contexts is "other"."""
+        self._add_time("other")
+        try:
+            yield
+        finally:
+            self._add_time(phase)
+
+    def _add_time(self, phase: Phase) -> None:
+        """Add the time since the last call to a phase."""
+        last, self._last_time = self._last_time, time.perf_counter()
+        self._progress.phase_seconds[phase] += self._last_time - last
+
+    def _total_seconds(self) -> float:
+        """Return the time of all phases until now."""
+        self._add_time("other")
+        return sum(self._progress.phase_seconds.values())
 
     def _store(self, data: TensorDict) -> int:
         """Add collected transitions to the replay and count steps, faults and successes.
@@ -277,12 +299,12 @@ class Experiment:
     def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
         self._is_between_updates = False
-        with self._clock.phase("updates"):
+        with self._timed("updates"):
             scalars = take_update()
         self._is_between_updates = True
         updates = self.algorithm.updates
         self._bar.update()
-        self._log_duration(self._timer.tick())
+        self._log_duration()
         is_due = updates % self.config.log_every == 0
         if is_due:
             self._log_update(scalars)
@@ -305,10 +327,15 @@ class Experiment:
             values["train/success_rate"] = sum(progress.recent) / len(progress.recent)
         self.log.write(self.algorithm.updates, values)
 
-    def _log_duration(self, seconds_per_update: float | None) -> None:
-        """Log the expected duration of the remaining updates, if it has just been measured."""
-        if seconds_per_update is None:
+    def _log_duration(self) -> None:
+        """Log the expected duration of the remaining updates after the first ones of a phase."""
+        times, seconds = self._update_times, self._progress.phase_seconds
+        if len(times) == WARM_UP_UPDATES + MEASURED_UPDATES:
             return
+        times.append(seconds["updates"] + seconds["collection"])
+        if len(times) < WARM_UP_UPDATES + MEASURED_UPDATES:
+            return
+        seconds_per_update = (times[-1] - times[WARM_UP_UPDATES - 1]) / MEASURED_UPDATES
         self._seconds_per_update = seconds_per_update
         target = self.config.stop_at_success
         remaining = self.config.total_updates - self.algorithm.updates
@@ -327,17 +354,15 @@ class Experiment:
         updates, curve = self.algorithm.updates, self._progress.curve
         is_new = not curve or updates > curve[-1].updates
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
-            start = time.perf_counter()
             self._evaluate_and_save()
-            seconds = time.perf_counter() - start
-            self._timer.exclude(seconds)
-            self._log_end(seconds)
+            self._log_end()
 
-    def _log_end(self, seconds_per_evaluation: float) -> None:
+    def _log_end(self) -> None:
         """Log the expected duration of the rest of the run after two evaluations in training."""
-        config, updates = self.config, self.algorithm.updates
-        if self._seconds_per_update is None or len(self._progress.curve) > 3:
+        config, updates, progress = self.config, self.algorithm.updates, self._progress
+        if self._seconds_per_update is None or len(progress.curve) > 3:
             return
+        seconds_per_evaluation = progress.phase_seconds["evaluation"] / len(progress.curve)
         remaining = config.total_updates - updates
         last = 2 * config.final_eval_episodes / config.eval_episodes
         evaluations = remaining // config.eval_every + last
@@ -352,7 +377,7 @@ class Experiment:
 
     def _save(self) -> None:
         """Save the state, with the positions of the environments in their episodes."""
-        self._progress.phase_seconds = self._clock.seconds()
+        self._add_time("other")
         if self._collection is not None:
             self._progress.positions = self._collection.get_positions()
         self._state.save(self.algorithm.updates)
@@ -385,7 +410,7 @@ class Experiment:
             CurvePoint(
                 updates=updates,
                 env_steps=progress.env_steps,
-                seconds=self._clock.total(),
+                seconds=self._total_seconds(),
                 **asdict(evaluation),
             )
         )
@@ -411,7 +436,7 @@ class Experiment:
     @contextmanager
     def _evaluating(self) -> Iterator[EnvBase]:
         """Context of the phase of evaluations, with their environments."""
-        with self._phase("evaluation"), self._clock.phase("evaluation"):
+        with self._phase("evaluation"), self._timed("evaluation"):
             if self._eval_env is None:
                 seed = self.config.derived_seed(SeedUse.EVALUATION)
                 self._eval_env = make_env(self.config, seed)

@@ -53,7 +53,7 @@ from ba_torchrl.training.checkpoint import (
     read_versions,
 )
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
-from ba_torchrl.training.duration import precision
+from ba_torchrl.training.precision import precision
 from ba_torchrl.training.protocol import PROTOCOL, count_parameters
 
 logger = logging.getLogger(__name__)

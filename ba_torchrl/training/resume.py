@@ -16,7 +16,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
@@ -58,8 +58,10 @@ class Progress:
     """Of the expert that played demonstrations or labels states; None of no or an unknown one."""
     expert_labels: int = 0
     """States of the collection that the expert labelled and the replay stored."""
-    phase_seconds: dict[Phase, float] = field(default_factory=dict)
-    """Wall time by phase until the state was saved."""
+    phase_seconds: dict[Phase, float] = field(
+        default_factory=lambda: dict.fromkeys(get_args(Phase), 0.0)
+    )
+    """Wall time by phase."""
     precisions: list[str] = field(default_factory=list)
     """Number formats in which the networks computed; several after a move to another machine."""
     resumed_at: list[int] = field(default_factory=list)

@@ -287,7 +287,7 @@ def test_doctor_goes_on_with_a_package_that_is_damaged(capsys, monkeypatch):
 @pytest.mark.slow
 def test_speed_prints_rates(capsys, monkeypatch):
     words = ["close_loop/block_reaching", "env.obs_size=64", "steps=4", "num_envs=2", "updates=1"]
-    monkeypatch.setattr("ba_torchrl.training.duration.WARM_UP_UPDATES", 0)
+    monkeypatch.setattr("ba_torchrl.commands.speed.WARM_UP_UPDATES", 0)
     cli.main(["speed", *words, "networks=[cnn]"])
     rows = [line for line in capsys.readouterr().out.splitlines() if "block_reaching" in line]
     assert len(rows) == 4

@@ -29,9 +29,9 @@ from ba_torchrl.training.checkpoint import (
 )
 from ba_torchrl.training.collection import gather_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.duration import precision
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.precision import precision
 from tests.recipes import recipe
 
 TINY = {

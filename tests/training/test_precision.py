@@ -1,3 +1,5 @@
+"""What a run says of its hardware and of the time that it takes."""
+
 import time
 
 import pytest
@@ -5,29 +7,26 @@ import torch
 
 from ba_torchrl.core import hardware
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training import duration
+from ba_torchrl.training import experiment
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.duration import (
-    MEASURED_UPDATES,
-    WARM_UP_UPDATES,
-    UpdateTimer,
-    compute_path,
-)
 from ba_torchrl.training.evaluation import Evaluation
-from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.experiment import MEASURED_UPDATES, WARM_UP_UPDATES, Experiment
+from ba_torchrl.training.precision import compute_path
 from tests.training.test_experiment import TINY, tiny
 
 
-def test_the_first_updates_are_measured_once_without_the_very_first(monkeypatch):
+def test_the_first_updates_and_evaluations_are_not_measured(tmp_path, monkeypatch):
     now = [0.0]
     monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    timer, seen = UpdateTimer(), []
-    for update in range(60):
-        now[0] += 100.0 if update < WARM_UP_UPDATES else 0.5
-        seen.append(timer.tick())
-    index = WARM_UP_UPDATES + MEASURED_UPDATES - 1
-    assert seen[index] == pytest.approx(0.5)
-    assert all(value is None for i, value in enumerate(seen) if i != index)
+    with Experiment(tiny(tmp_path), progress=False) as run:
+        for count in range(WARM_UP_UPDATES + MEASURED_UPDATES):
+            assert run._seconds_per_update is None
+            with run._timed("updates"):
+                now[0] += 100.0 if count < WARM_UP_UPDATES else 0.5
+            run._log_duration()
+            with run._timed("evaluation"):
+                now[0] += 50.0
+    assert run._seconds_per_update == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
@@ -74,8 +73,8 @@ def test_a_limit_of_the_instructions_is_named(monkeypatch, variable, limit, expe
 
 
 def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog, monkeypatch):
-    monkeypatch.setattr(duration, "WARM_UP_UPDATES", 2)
-    monkeypatch.setattr(duration, "MEASURED_UPDATES", 3)
+    monkeypatch.setattr(experiment, "WARM_UP_UPDATES", 2)
+    monkeypatch.setattr(experiment, "MEASURED_UPDATES", 3)
     measured = 5
     changes = {
         "pretrain_updates": measured + 1,
@@ -94,21 +93,6 @@ def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog, monkeypatch
     assert f"for the remaining 3 {ending}" in second
     assert "with collection" not in first
     assert "s an update with collection, " in second
-
-
-def test_other_work_between_updates_is_left_out(monkeypatch):
-    now = [0.0]
-    monkeypatch.setattr(time, "perf_counter", lambda: now[0])
-    timer = UpdateTimer()
-    for _ in range(2):
-        for number in range(WARM_UP_UPDATES + MEASURED_UPDATES):
-            now[0] += 2.0
-            found = timer.tick()
-            if number % 7 == 3:
-                now[0] += 100.0
-                timer.exclude(100.0)
-        assert found == pytest.approx(2.0)
-        timer.restart()
 
 
 @pytest.mark.parametrize(
