@@ -18,7 +18,6 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.checks import ChecksPolicy, checked_action
-from ba_torchrl.envs.copying import CopiesWithState
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_bodies, check_observation
 from ba_torchrl.envs.observations import (
@@ -61,7 +60,7 @@ class _MadeByTask(type(EnvBase)):
         return env if device is None else env.to(device)
 
 
-class BulletArmEnv(ChecksPolicy, CopiesWithState, EnvBase, metaclass=_MadeByTask):
+class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     """A manipulation task as an unbatched TorchRL environment.
 
     The seed determines the episodes: episode n of seed s is the same in any process and after any

@@ -117,19 +117,36 @@ def test_reading_the_position_changes_nothing():
 
 def test_a_position_that_the_actions_do_not_determine_is_refused():
     env = ba_torchrl.make("close_loop/block_reaching", seed=0, obs_size=16)
-    with pytest.raises(SimulationError, match="do not determine"):
-        env.get_position()
     env.reset()
     env.rand_step()
     state = env.get_state()
-    with pytest.raises(SimulationError, match="do not determine"):
-        env.get_position()
-    env.reset()
-    assert len(env.get_position()["actions"][0]) == 0
-    env.reset(state, set_state=True)
-    with pytest.raises(SimulationError, match="do not determine"):
-        env.get_position()
+
+    def set_state():
+        env.reset(state, set_state=True)
+
+    for act in (env.get_state, set_state, lambda: env.set_seed(5)):
+        env.reset()
+        assert len(env.get_position()["actions"][0]) == 0
+        act()
+        with pytest.raises(SimulationError, match="do not determine"):
+            env.get_position()
+        other = copy.deepcopy(env)
+        assert_equal(
+            *(each.step(state.clone().set("action", torch.ones(5))) for each in (env, other))
+        )
+        assert_equal(env.reset(), other.reset())
+        other.close()
     env.close()
+
+
+def test_an_environment_that_was_not_reset_has_the_position_of_its_first_episode():
+    first, second = (
+        ba_torchrl.make("close_loop/block_reaching", seed=seed, obs_size=16) for seed in (0, 1)
+    )
+    second.continue_from(first.get_position())
+    assert_equal(second.reset(), first.reset())
+    first.close()
+    second.close()
 
 
 def test_a_seed_takes_precedence_over_a_position():
