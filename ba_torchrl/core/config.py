@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator
 from functools import cache
-from typing import Any, Literal, TypedDict, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from pydantic import (
@@ -353,46 +353,6 @@ class EnvConfig(StrictModel):
             for name, field in cls.model_fields.items()
             if (field.json_schema_extra or {}).get("control", control) == control
         }
-
-
-class EnvKeywords(TypedDict, total=False):
-    """The keywords of `ba_torchrl.make`, for type checkers; `EnvConfig` describes them."""
-
-    robot: str
-    action_sequence: str | None
-    workspace: tuple[Interval, Interval, Interval] | None
-    object_scale_range: Interval | None
-    max_steps: int | None
-    num_objects: int | None
-    obs_size: int
-    in_hand_size: int | None
-    in_hand_mode: str | None
-    top_down_approach: bool
-    fast_mode: bool
-    render: bool
-    random_orientation: bool
-    half_rotation: bool | None
-    workspace_check: Literal["point", "bounding_box"]
-    close_loop_tray: bool
-    view_type: str
-    view_scale: float
-    dpos: float
-    drot: float
-    obs_type: Literal["pixel", "vec"]
-    rgb: bool
-    point_cloud: int
-    observations: tuple[str, ...]
-    camera_size: int | None
-    floor_color: Rgb | None
-    workspace_color: Rgb | None
-    physics_mode: Literal["fast", "slow", "custom"]
-    time_step_s: float | None
-    solver_iterations: int | None
-    solver_residual: float | None
-    reward: Literal["sparse", "dense", "difference"]
-    reward_discount: float
-    expert: bool
-    seed: int | None
 
 
 @cache

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
-from typing import Any, overload
+from typing import Any
 
 from torchrl.envs import EnvBase
-from typing_extensions import Unpack
 
-from ba_torchrl.core.config import EnvKeywords, WorkerOptions, parse
+from ba_torchrl.core.config import WorkerOptions, parse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import module_names
 from ba_torchrl.envs.base import BulletArmEnv
@@ -18,12 +17,18 @@ from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.envs.vector.make import make_vector, processes_save_time
 
 
-@overload
-def make(task: str | ResolvedEnv, **config: Unpack[EnvKeywords]) -> BulletArmEnv: ...
-@overload
-def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv: ...
 def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv:
-    """Make a TorchRL environment: `BulletArmEnv` with the same arguments."""
+    """Make a TorchRL environment.
+
+    Args:
+        task: an id such as "close_loop/block_picking", see `ba_torchrl.list_tasks`; or what
+            `resolve_env` returned.
+        config: fields of `ba_torchrl.core.config.EnvConfig` and of the task's own parameters, such
+            as ``robot="kuka"``, ``seed=0``, ``obs_size=64`` or ``expert=True``; and ``device``.
+
+    Raises:
+        ConfigError: as for `BulletArmEnv`.
+    """
     return BulletArmEnv(task, **config)
 
 

@@ -1,11 +1,8 @@
 """What a task tells of itself."""
 
-import typing
-
 import pytest
 
 import ba_torchrl
-from ba_torchrl.core.config import EnvConfig, EnvKeywords
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs import description
 from ba_torchrl.tasks.base import TASKS, versions_of
@@ -47,13 +44,6 @@ def test_every_task_of_the_package_has_a_goal_and_an_experts_score():
 def test_an_unknown_task_is_named():
     with pytest.raises(ConfigError, match="Did you mean 'close_loop/block_picking'"):
         ba_torchrl.describe("close_loop/block_pickin")
-
-
-def test_the_keywords_for_type_checkers_are_the_fields():
-    hints = typing.get_type_hints(EnvKeywords)
-    assert list(hints) == list(EnvConfig.model_fields)
-    fields = typing.get_type_hints(EnvConfig)
-    assert {name: fields[name] for name in hints} == hints
 
 
 def test_the_text_of_an_environment_names_task_robot_image_and_action():
