@@ -6,7 +6,6 @@ failure of a run is recorded and does not stop the others.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import math
 import os
@@ -76,10 +75,11 @@ def run_all(
         while waiting or running:
             while waiting and len(running) < jobs:
                 run = waiting.popleft()
-                try:
+                holder = lock_holder(run.folder)
+                if holder is None:
                     running.append(_Job(run, worker, max_hours))
-                except BlockingIOError:
-                    _report_skipped(run, lock_holder(run.folder) or "another process")
+                else:
+                    _report_skipped(run, holder)
                     bar.update()
             if time.monotonic() - shown_at > refresh_s:
                 bar.set_postfix_str("; ".join(job.progress() for job in running))
@@ -132,11 +132,7 @@ def _report_skipped(run: ExperimentConfig, process: str) -> None:
 
 
 class _Job:
-    """A run in a separate process.
-
-    Raises:
-        BlockingIOError: another process runs it.
-    """
+    """A run in a separate process."""
 
     def __init__(
         self, run: ExperimentConfig, worker: Sequence[str], max_hours: float | None
@@ -149,11 +145,6 @@ class _Job:
         self._is_asked_to_end = False
         run.folder.mkdir(parents=True, exist_ok=True)
         self._log = (run.folder / LOG_FILE).open("a")
-        try:  # the process inherits the lock and keeps it if this one is killed
-            fcntl.flock(self._log, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            self._log.close()
-            raise
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
         self._process = subprocess.Popen(
             worker,
@@ -198,6 +189,10 @@ class _Job:
         self._log.close()
         code = self._process.returncode
         if status(self.run).state == "done":
+            return None
+        holder = lock_holder(self.run.folder)
+        if holder is not None and not holder.startswith(f"process {self._process.pid} "):
+            _report_skipped(self.run, holder)  # which started at the same time
             return None
         reason = f"exit status {code}"
         if self._timed_out:

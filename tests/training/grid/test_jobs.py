@@ -1,6 +1,5 @@
 """Runs of a grid in separate processes: failures, interruptions, resumption."""
 
-import fcntl
 import functools
 import json
 import os
@@ -247,16 +246,25 @@ def test_a_folder_with_other_settings_is_refused_before_anything_starts(tmp_path
     assert calls(changed[1]) == 0
 
 
-def test_a_run_of_another_process_is_left_to_it(tmp_path, fake, capsys):
-    runs = planned(tmp_path)
-    runs[1].folder.mkdir(parents=True)
-    with (runs[1].folder / "run.log").open("a") as log:
-        fcntl.flock(log, fcntl.LOCK_EX)
-        assert fake(runs) == {}
-    assert "skipped: another process runs the experiment in" in capsys.readouterr().out
-    assert (calls(runs[0]), calls(runs[1])) == (1, 0)
+@pytest.mark.parametrize("jobs_at_once", [1, 2])
+def test_a_run_that_another_process_starts_meanwhile_is_left_to_it(
+    jobs_at_once, tmp_path, fake, capsys, monkeypatch
+):
+    runs, sleep, locks = planned(tmp_path), time.sleep, []
+
+    def start(seconds):
+        locks.append(locks[0] if locks else RunLock(runs[1].folder))
+        sleep(seconds)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(jobs.time, "sleep", start)
+        assert fake(runs, {1: "fail"}, jobs=jobs_at_once) == {}
+    assert f"skipped: process {os.getpid()} on " in capsys.readouterr().out
+    started = jobs_at_once - 1  # the second of two runs is under way when the lock is taken
+    assert (calls(runs[0]), calls(runs[1])) == (1, started)
+    locks[0].release()
     assert fake(runs) == {}
-    assert (calls(runs[0]), calls(runs[1])) == (1, 1)
+    assert (calls(runs[0]), calls(runs[1])) == (1, started + 1)
 
 
 def test_a_run_that_still_works_is_skipped_by_the_name_of_its_process(tmp_path, fake, capsys):
