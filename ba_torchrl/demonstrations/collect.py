@@ -173,9 +173,6 @@ def check_noise(noise: float, source: Source, name: str) -> None:
         noise: the probability.
         source: of the demonstrations.
         name: of the setting, for error messages.
-
-    Raises:
-        ConfigError: it is not in [0, 1), or the source has no noise.
     """
     if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < 1:
         raise ConfigError(f"{name}: must be at least 0 and less than 1, got {noise!r}")
@@ -191,9 +188,6 @@ def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: s
         source: of the demonstrations.
         turns: indices of the components that turn the gripper.
         name: of the setting, for error messages.
-
-    Raises:
-        ConfigError: see `check_noise`; or there is noise and no such component.
     """
     check_noise(noise, source, name)
     if noise and not turns:

@@ -41,9 +41,6 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
         pin_memory: as for `TensorDictReplayBuffer`.
         prefetch: as for `TensorDictReplayBuffer`.
         transform: of samples.
-
-    Raises:
-        ConfigError: as `load_demonstrations`.
     """
 
     def __init__(

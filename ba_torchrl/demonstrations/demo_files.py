@@ -183,10 +183,6 @@ def check_demonstrations(
         env: fields of `EnvConfig` of the environments.
         least: number of episodes that are needed.
         mapping: as for `load_demonstrations`.
-
-    Raises:
-        ConfigError: there are too few at ``path``, their files are damaged, or task or parameters
-            differ; the message names every difference.
     """
     path = Path(path)
     if _is_own(path, mapping):
@@ -207,9 +203,6 @@ def recorded_expert(
     Args:
         path: as for `load_demonstrations`.
         mapping: as for `load_demonstrations`.
-
-    Raises:
-        ConfigError: their files are damaged.
     """
     path = Path(path)
     if not _is_own(path, mapping):
@@ -219,11 +212,7 @@ def recorded_expert(
 
 
 def _is_own(path: Path, mapping: object) -> bool:
-    """Whether there is a folder that `save_demonstrations` wrote, or, unmapped, nothing known.
-
-    Raises:
-        ConfigError: there is one, and a mapping of somebody else's entries.
-    """
+    """Whether there is a folder that `save_demonstrations` wrote, or, unmapped, nothing known."""
     is_own = os.path.exists(path / METADATA_FILE)
     if is_own and mapping is not None:
         raise ConfigError(f"{path} has our entries; leave out the mapping (demonstrations_mapping)")
@@ -231,11 +220,7 @@ def _is_own(path: Path, mapping: object) -> bool:
 
 
 def read_metadata(path: Path) -> dict[str, Any]:
-    """Return what a folder that `save_demonstrations` wrote says of its episodes.
-
-    Raises:
-        ConfigError: there are none at ``path``, or their files are damaged.
-    """
+    """Return what a folder that `save_demonstrations` wrote says of its episodes."""
     try:
         metadata = read_json(path / METADATA_FILE)
     except (OSError, ValueError, RecursionError) as error:

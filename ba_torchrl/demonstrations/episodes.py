@@ -130,9 +130,6 @@ def play_seeds(
     Returns:
         Episodes as TensorDicts [T] with the actions and the entries of `RESULT_KEYS`, in the order
         of ``seeds``.
-
-    Raises:
-        ConfigError: a trained policy is for another environment.
     """
     check_policy(policy, env)
     (num_envs,) = env.batch_size

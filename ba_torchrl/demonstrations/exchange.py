@@ -196,10 +196,6 @@ def count_demonstrations(
         task: id of the task.
         env: fields of `EnvConfig`.
         mapping: of the entries of somebody else's file.
-
-    Raises:
-        ConfigError: task or parameters differ from those of the card, its files were altered; or an
-            entry is missing, or has another type or shape than the environment's.
     """
     form = _format(path)
     if mapping is None:
@@ -296,11 +292,7 @@ def _mapped(
 def _mapped_specs(
     path: Path, task: str, env: dict[str, Any], mapping: DemonstrationMapping
 ) -> dict[str, TensorSpec]:
-    """Return the specifications of an environment, for whose entries there is a source.
-
-    Raises:
-        ConfigError: an entry has no source, or is unknown.
-    """
+    """Return the specifications of an environment, for whose entries there is a source."""
     specs = _specs(task, env)
     wanted = {*specs, *RESULTS, keys.INSTRUCTION}
     if unknown := mapping.entries.keys() - wanted:
@@ -338,9 +330,6 @@ def _fitted_entries(
         specs: of the environment.
         is_sparse: whether its reward is 1 on success, else 0.
         reads: False to check shapes only; the returned arrays have no rows.
-
-    Raises:
-        ConfigError: an entry is missing, or does not fit.
     """
     arrays, rows = {}, {}
     for key, source in mapping.entries.items():
@@ -419,9 +408,6 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
     Numbers become flags where they exceed 0.5; channels of images may be last; an axis of one, for
     a channel or at the end, may be missing. Values beyond the range by no more than rounding are
     clipped.
-
-    Raises:
-        ConfigError: the shape differs, or a value is out of range.
     """
     shape = tuple(spec.shape)
     if values.ndim and (*values.shape[1:], 1) == shape:
@@ -454,11 +440,7 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
 
 
 def _one_number(values: np.ndarray) -> np.ndarray:
-    """Return results of the steps as [T, 1].
-
-    Raises:
-        ConfigError: they are text, not finite, or several numbers per step.
-    """
+    """Return results of the steps as [T, 1]."""
     if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
         raise ConfigError(
             "has values that are no finite numbers; needed one number per step: set components, "
@@ -472,11 +454,7 @@ def _one_number(values: np.ndarray) -> np.ndarray:
 
 
 def _check_zero_or_one(values: np.ndarray) -> None:
-    """Check that results are 0 or 1, but for rounding.
-
-    Raises:
-        ConfigError: they are not.
-    """
+    """Check that results are 0 or 1, but for rounding."""
     if (np.minimum(abs(values), abs(values - 1.0)) > _TOLERANCE).any():
         raise ConfigError(
             f"has values from {values.min():g} to {values.max():g}, needed 0 or 1; set scale and "
@@ -485,11 +463,7 @@ def _check_zero_or_one(values: np.ndarray) -> None:
 
 
 def _check_rows(what: str, rows: int, steps: int, is_observed: bool) -> None:
-    """Check that there is a row for each step, of observations perhaps also one after the last.
-
-    Raises:
-        ConfigError: there is not; the message begins with ``what``.
-    """
+    """Check that there is a row for each step, of observations perhaps also one after the last."""
     if rows - steps not in ((0, 1) if is_observed else (0,)):
         raise ConfigError(f"{what} has {rows} rows, and there are {steps} actions")
 
@@ -510,11 +484,7 @@ def _until_end(arrays: Arrays) -> Arrays:
 
 
 def _with_results(arrays: Arrays, task: str, env: dict[str, Any]) -> Arrays:
-    """Return an episode with the results of its steps, which its file may lack.
-
-    Raises:
-        ConfigError: the reward is not that of the success, or the instruction not one sentence.
-    """
+    """Return an episode with the results of its steps, which its file may lack."""
     resolved = resolve_env(task, env)
     reward_kind = resolved.config.reward
     steps = len(arrays[keys.ACTION])
@@ -582,12 +552,7 @@ def _to_array(tensordict: TensorDictBase, key: str) -> np.ndarray:
 def _to_episodes(
     form: Format, path: Path, entries: Mapping[str, Entry], episodes: Sequence[StoredArrays]
 ) -> list[TensorDict]:
-    """Return episodes [T] as training has them, from the entries of a file.
-
-    Raises:
-        ConfigError: an entry is missing or has another shape than the card says, or an episode has
-            no steps.
-    """
+    """Return episodes [T] as training has them, from the entries of a file."""
     converted = []
     for number, arrays in enumerate(episodes):
         with _named(path, number):
@@ -660,9 +625,6 @@ def check_same_environment(
         task: id of the task of the run.
         env: fields of `EnvConfig` of the run.
         metadata: of the demonstrations: task, versions, source and env.
-
-    Raises:
-        ConfigError: they differ; the message names every difference.
     """
     versions = versions_of(task)
     of_task = {"task": metadata["task"], "task_version": metadata["task_version"]}

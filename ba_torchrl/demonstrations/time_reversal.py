@@ -46,9 +46,6 @@ class DeconstructionEnv(OpenLoopEnv):
     """An open-loop environment whose episodes start with the structure and take it apart.
 
     Every observation contains the action that reverses the last one.
-
-    Raises:
-        ConfigError: as for `OpenLoopEnv`, or the task has no structure, or the reward is dense.
     """
 
     def __init__(self, resolved: ResolvedEnv) -> None:
@@ -142,9 +139,6 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
 
     Args:
         episode: steps [T] of a `DeconstructionEnv`.
-
-    Raises:
-        ValueError: the episode is not `is_reversible`.
     """
     if not is_reversible(episode):
         raise ValueError("the episode cannot be reversed: an action moved no object, or several")

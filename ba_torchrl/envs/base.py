@@ -177,11 +177,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
 
     @property
     def scene(self) -> Scene:
-        """The world, robot and task of the current episode.
-
-        Raises:
-            SimulationError: the environment has not been reset.
-        """
+        """The world, robot and task of the current episode."""
         if self._episodes.scene is None:
             raise SimulationError("reset the environment first")
         return self._episodes.scene
@@ -247,9 +243,6 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
 
         Returns:
             A TensorDict with the entry ``state``.
-
-        Raises:
-            SimulationError: the environment has not been reset.
         """
         return TensorDict({keys.STATE: NonTensorData(self._get_state())}, [], device=self.device)
 
@@ -273,11 +266,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         return type(self), self.task_id, self.config.model_dump(exclude={"seed", "render"})
 
     def _set_state(self, tensordict: TensorDictBase | None) -> TensorDict:
-        """Restore a state and return its entries.
-
-        Raises:
-            ConfigError: there is none, or it is that of other parameters.
-        """
+        """Restore a state and return its entries."""
         if tensordict is None or keys.STATE not in tensordict.keys():  # noqa: SIM118
             raise ConfigError(
                 f"reset(td, set_state=True) needs the entry {keys.STATE!r} of get_state(). Where "
@@ -520,11 +509,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
             raise
 
     def _measure_progress(self, scene: Scene) -> float:
-        """Return the task's progress, 0 if the reward is sparse.
-
-        Raises:
-            ConfigError: the task's method returns no number in [0, 1).
-        """
+        """Return the task's progress, 0 if the reward is sparse."""
         if self.config.reward == "sparse":
             return 0.0
         with scene.world.fixed_poses():

@@ -20,21 +20,13 @@ class ChecksPolicy:
     def rollout(
         self, max_steps: int, policy: Any = None, *args: Any, **kwargs: Any
     ) -> TensorDictBase:
-        """Play at most ``max_steps`` steps; see `EnvBase.rollout`.
-
-        Raises:
-            ConfigError: see `check_policy`.
-        """
+        """Play at most ``max_steps`` steps; see `EnvBase.rollout`."""
         check_policy(policy, self)
         return super().rollout(max_steps, policy, *args, **kwargs)
 
 
 def check_policy(policy: Any, env: EnvBase) -> None:
-    """Let a policy with the method ``check_env``, such as `TrainedPolicy`, check an environment.
-
-    Raises:
-        ConfigError: the policy was trained with other observations or actions.
-    """
+    """Let a policy with the method ``check_env``, such as `TrainedPolicy`, check an environment."""
     if hasattr(policy, "check_env"):
         policy.check_env(env)
 
@@ -46,9 +38,6 @@ def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: s
         action: [A] float32; values beyond its bounds are allowed, the environment clips them.
         task_id: for the message.
         action_sequence: one letter per component.
-
-    Raises:
-        InvalidActionError: the action is missing, not finite, or has another shape or type.
     """
     size = len(action_sequence)
     if action is None:
@@ -73,10 +62,6 @@ def check_actions(
         actions: [n, A], one row per environment.
         spec: of ``actions``; values out of its bounds are allowed, the environments clip them.
         stepped: [n] or [n, 1] bool, the environments that step; None for all.
-
-    Raises:
-        InvalidActionError: an action is missing, not finite, or has another shape or type than
-            ``spec``.
     """
     if actions is None:
         raise InvalidActionError(

@@ -111,9 +111,6 @@ def describe(task: str) -> TaskDescription:
 
     Args:
         task: one of `ba_torchrl.list_tasks`.
-
-    Raises:
-        ConfigError: there is no such task; the message lists the known ones.
     """
     from ba_torchrl.envs.factory import make  # imports torch
 

@@ -109,9 +109,6 @@ class Episodes:
         Args:
             rng: draws the scale and the initial poses.
             with_new_objects: place new objects even if the task continues.
-
-        Raises:
-            PlacementError: no valid start was found.
         """
         scene = self.scene
         if scene is not None and not with_new_objects and scene.task.continues:
@@ -165,9 +162,6 @@ def evaluate_at_rest(scene: Scene) -> tuple[dict[str, bool], bool]:
 
     Return the conditions of success of the scene at rest, and whether it is valid. The scene is
     settled only if all conditions hold before.
-
-    Raises:
-        SimulationError: the state of the scene is a fault; see `check_bodies`.
     """
     check_bodies(scene)
     steps = scene.world.steps

@@ -56,9 +56,6 @@ def make_vector_env(
         make: makes one environment; a function or class that the processes can import.
         options: as for `make`, and single fields of `ba_torchrl.core.config.WorkerOptions`, such as
             ``parallel=False`` or ``timeout_s=120``.
-
-    Raises:
-        ConfigError: as for `make`.
     """
     of_workers = {name: options.pop(name) for name in WorkerOptions.model_fields if name in options}
     if not isinstance(workers, WorkerOptions | None):

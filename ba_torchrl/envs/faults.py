@@ -53,11 +53,7 @@ def check_bodies(scene: Scene, *, may_be_lost: bool = False) -> None:
 
 
 def check_observation(observation: Mapping[str, torch.Tensor | NonTensorData]) -> None:
-    """Check that the entries of an observation are finite.
-
-    Raises:
-        SimulationError: one is not.
-    """
+    """Check that the entries of an observation are finite."""
     for key, value in observation.items():
         if (
             isinstance(value, torch.Tensor)

@@ -45,9 +45,6 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         render_mode: ``rgb_array`` for images from `render`, ``human`` for PyBullet's window.
         register_modules: names of modules outside the package that register the task or its robot.
         config: fields of `ba_torchrl.core.config.EnvConfig`.
-
-    Raises:
-        ConfigError: the task or a parameter is unknown, or its value cannot be used.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}
@@ -83,11 +80,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observation, dict[str, Any]]:
-        """Start an episode: the first one of ``seed``, or the next one of the current seed.
-
-        Raises:
-            ConfigError: ``options`` are given; there are none.
-        """
+        """Start an episode: the first one of ``seed``, or the next one of the current seed."""
         super().reset(seed=seed)
         if options:
             raise ConfigError(
@@ -99,11 +92,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         return self._split(self.torchrl_env.reset())
 
     def step(self, action: np.ndarray) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Execute an action of `action_space` (floats of any precision).
-
-        Raises:
-            InvalidActionError: the action has the wrong shape or type, or is not finite.
-        """
+        """Execute an action of `action_space` (floats of any precision)."""
         following = self.torchrl_env.step(_as_tensordict(action))[keys.NEXT]
         observation, info = self._split(following)
         return (
@@ -152,11 +141,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
 
 def space_of(spec: TensorSpec) -> spaces.Space:
-    """Return the Gymnasium space of a TorchRL spec, with the same shape.
-
-    Raises:
-        TypeError: the spec has no corresponding space.
-    """
+    """Return the Gymnasium space of a TorchRL spec, with the same shape."""
     if isinstance(spec, Composite):
         return spaces.Dict({key: space_of(part) for key, part in spec.items()})
     if isinstance(spec, Binary):

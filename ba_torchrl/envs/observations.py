@@ -69,20 +69,12 @@ class Observation(ABC):
 
 
 def enabled_observations(config: EnvConfig, workspace: Workspace) -> list[Observation]:
-    """Return the observations that a configuration enables.
-
-    Raises:
-        ConfigError: a name is unknown.
-    """
+    """Return the observations that a configuration enables."""
     return [enabled(config, workspace) for enabled in enabled_classes(config)]
 
 
 def enabled_classes(config: EnvConfig) -> list[type[Observation]]:
-    """Return the classes of the observations that a configuration enables.
-
-    Raises:
-        ConfigError: a name is unknown.
-    """
+    """Return the classes of the observations that a configuration enables."""
     for name in config.observations:
         _ = OBSERVATIONS[name]
     return [
@@ -93,11 +85,7 @@ def enabled_classes(config: EnvConfig) -> list[type[Observation]]:
 
 
 def merge_entries(parts: list[dict]) -> dict:
-    """Return the union of dictionaries with different keys.
-
-    Raises:
-        ConfigError: two of them have the same key.
-    """
+    """Return the union of dictionaries with different keys."""
     entries: dict = {}
     for part in parts:
         if repeated := entries.keys() & part.keys():

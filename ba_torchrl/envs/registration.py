@@ -40,9 +40,6 @@ def register_task(task: str) -> None:
     No step limit is registered, because the environment truncates the episode at ``max_steps`` of
     its configuration. A task from outside the package is registered with its module, which the
     processes of ``gymnasium.make_vec`` import.
-
-    Raises:
-        ValueError: another task has the same id.
     """
     from gymnasium.envs.registration import register, registry
 

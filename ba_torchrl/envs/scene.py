@@ -105,9 +105,6 @@ def build_scene(
         physics: settings of the engine, which the configuration can override.
         make_controller: builds the controller of a robot and a task.
         window: show the world in PyBullet's window.
-
-    Raises:
-        ConfigError: the window needs a display, and there is none.
     """
     world = _empty_world(config, settings.workspace, physics, window)
     terrain = Tray(world, settings.workspace) if config.close_loop_tray else None
@@ -118,11 +115,7 @@ def build_scene(
 
 
 def check_action_limits(robot: Robot, workspace: Workspace, heights_m: Sequence[float]) -> None:
-    """Check that a robot reaches some heights at every corner of the workspace.
-
-    Raises:
-        ConfigError: a point is out of reach.
-    """
+    """Check that a robot reaches some heights at every corner of the workspace."""
     for x in workspace.x:
         for y in workspace.y:
             for z in heights_m:

@@ -33,9 +33,6 @@ class Control(Protocol):
 
         Args:
             config: the parameters, with defaults filled in.
-
-        Raises:
-            ConfigError: the control does not support them.
         """
 
 
@@ -103,18 +100,11 @@ class ResolvedEnv:
 
         Args:
             changes: fields of `EnvConfig`.
-
-        Raises:
-            ConfigError: as `resolve_env`.
         """
         return resolve_env(self, changes)
 
     def check_spawned_process_knows(self) -> None:
-        """Check that a spawned process can import what registers the parts of the environment.
-
-        Raises:
-            ConfigError: a part is defined where no other process can import it.
-        """
+        """Check that a spawned process can import what registers the parts of the environment."""
         for registry, name, module in _plugins(self.task_id, self.config):
             if module in MAIN:
                 check_spawned_process_knows(registry.kind, name)
@@ -214,11 +204,7 @@ def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], s
 
 
 def _own_values(task_id: str, values: dict[str, Any], model: type[EnvConfig]) -> dict[str, Any]:
-    """Return the values without defaults of other tasks' parameters.
-
-    Raises:
-        ConfigError: another task's parameter has a value that is not its default.
-    """
+    """Return the values without defaults of other tasks' parameters."""
     own = dict(values)
     for name in values.keys() - model.model_fields.keys():
         fields = {other: TASKS[other].Parameters.model_fields.get(name) for other in TASKS}
@@ -250,11 +236,7 @@ def _with_defaults(task_class: type[Task], config: EnvConfig) -> EnvConfig:
 
 
 def _check_task_supports(task_id: str, config: EnvConfig) -> None:
-    """Check that a task supports the parameters of a configuration.
-
-    Raises:
-        ConfigError: a parameter has no meaning for the task, or an unsupported value.
-    """
+    """Check that a task supports the parameters of a configuration."""
     task_class = TASKS[task_id]
     if config.object_scale_range is not None:
         check_scales(task_id, config.object_scale_range)

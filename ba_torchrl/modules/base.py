@@ -33,9 +33,6 @@ class ActorCriticSpec:
         vectors: length of each vector entry of the observation that the network sees, by key, in
             the order of its arguments after the holding flag.
         center_m: x and y of the workspace's centre, about which the scene rotates.
-
-    Raises:
-        ValueError: the sequence is empty, repeats a letter or holds one outside "pxyzr".
     """
 
     images: Mapping[str, ImageSpec]

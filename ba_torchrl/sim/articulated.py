@@ -25,9 +25,6 @@ class PrismaticJoint:
         axis: unit vector of the motion, in the frame of the body.
         limits_m: lower and upper joint limit, a range that contains the initial position 0.
         friction_n: greatest force of the dry friction.
-
-    Raises:
-        ValueError: the limits exclude 0, or the friction is negative.
     """
 
     axis: Vector = (1.0, 0.0, 0.0)
@@ -81,12 +78,7 @@ class ArticulatedLink(Body):
         return Pose(state[4], state[5])
 
     def set_pose(self, position: Vector, orientation: Quaternion) -> None:
-        """Teleport the articulated body; possible only through its fixed link.
-
-        Raises:
-            ValueError: this is the sliding link.
-            RuntimeError: the pose is fixed, see `World.fixed_poses`.
-        """
+        """Teleport the articulated body; possible only through its fixed link."""
         self._check_can_move()
         if not self.is_static:
             raise ValueError(f"{self.name} moves only along its joint: place the whole body")
@@ -112,9 +104,6 @@ class ArticulatedBody:
     Args:
         slider: shape of the sliding link, in the frame of the fixed link at joint position 0. Its
             centre of mass has no effect.
-
-    Raises:
-        ValueError: the base has a mass, or the slider has none.
     """
 
     def __init__(
@@ -184,11 +173,7 @@ class ArticulatedBody:
         return pybullet.getJointState(self.id, 0, physicsClientId=self.client)[0]
 
     def place(self, position: Vector, yaw_rad: float = 0.0, travel_m: float = 0.0) -> None:
-        """Teleport the fixed link to an upright pose and the joint to a position, at rest.
-
-        Raises:
-            ValueError: the joint position is outside of the joint limits.
-        """
+        """Teleport the fixed link to an upright pose and the joint to a position, at rest."""
         low, high = self.joint.limits_m
         if not low <= travel_m <= high:
             raise ValueError(f"{self.name}: travel_m {travel_m} is outside of [{low}, {high}]")

@@ -142,11 +142,7 @@ class Body:
         self.set_pose(position, yaw_quaternion(yaw_rad))
 
     def set_pose(self, position: Vector, orientation: Quaternion) -> None:
-        """Teleport the frame of the geometry to a pose, with zero velocity.
-
-        Raises:
-            RuntimeError: the pose is fixed, see `World.fixed_poses`.
-        """
+        """Teleport the frame of the geometry to a pose, with zero velocity."""
         self._check_can_move()
         if self._center is not None:
             position, orientation = bullet_compose(Pose(position, orientation), self._center)

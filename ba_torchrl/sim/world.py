@@ -176,11 +176,7 @@ class World:
             )
 
     def add(self, shape: Shape, name: str) -> Body:
-        """Load a body; possible only before `seal`.
-
-        Raises:
-            SimulationError: the world is sealed.
-        """
+        """Load a body; possible only before `seal`."""
         self._check_not_sealed(name)
         body = Body(self.client, shape, name)
         self._register(body)
@@ -192,9 +188,6 @@ class World:
         """Load a fixed body with a sliding part; possible only before `seal`.
 
         Both links are added to `bodies`.
-
-        Raises:
-            SimulationError: the world is sealed.
         """
         self._check_not_sealed(name)
         body = ArticulatedBody(self.client, base, slider, joint, name)
@@ -206,11 +199,7 @@ class World:
         self._pristine = self.snapshot()
 
     def restore_pristine(self) -> None:
-        """Restore the state saved by `seal`, including velocities and contacts.
-
-        Raises:
-            SimulationError: the world is not sealed.
-        """
+        """Restore the state saved by `seal`, including velocities and contacts."""
         if self._pristine is None:
             raise SimulationError("seal() the world before resetting it")
         self.restore(self._pristine)
@@ -230,10 +219,6 @@ class World:
 
         Args:
             snapshot: of this world, or of another with the same bodies.
-
-        Raises:
-            SimulationError: this world is closed.
-            RuntimeError: within `fixed_poses`.
         """
         self._check_not_fixed()
         if self.is_closed:
@@ -247,11 +232,7 @@ class World:
             body.apply_activity()
 
     def step(self, count: int = 1) -> None:
-        """Advance the physics by ``count`` time steps.
-
-        Raises:
-            RuntimeError: within `fixed_poses`.
-        """
+        """Advance the physics by ``count`` time steps."""
         self._check_not_fixed()
         for _ in range(count):
             pybullet.stepSimulation(physicsClientId=self.client)
@@ -408,11 +389,7 @@ def loading(path: str | os.PathLike[str]) -> Iterator[None]:
 
 
 def connect_window() -> int:
-    """Open PyBullet's window and return its client.
-
-    Raises:
-        SimulationError: DISPLAY is not set, or the process already has a window.
-    """
+    """Open PyBullet's window and return its client."""
     if sys.platform.startswith("linux") and not os.environ.get("DISPLAY"):
         raise SimulationError(
             "render=True opens a window, but DISPLAY is not set: use env.render() for images, or "

@@ -50,11 +50,7 @@ class Rows:
     """Why it cannot be used."""
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> np.ndarray:
-        """Read the values.
-
-        Raises:
-            ConfigError: they cannot be read.
-        """
+        """Read the values."""
         try:
             return np.asarray(plain(self.read()), dtype)
         except ConfigError:
@@ -230,11 +226,7 @@ class Format(ABC):
         """
 
     def library(self, module: str) -> Any:
-        """Import a module of the library.
-
-        Raises:
-            MissingPackageError: it is not installed.
-        """
+        """Import a module of the library."""
         try:
             return importlib.import_module(module)
         except ImportError as error:
@@ -290,11 +282,7 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
 
 
 def read_card(path: Path) -> Card | None:
-    """Return the card of a file of demonstrations; None if it has none.
-
-    Raises:
-        ConfigError: the card is damaged, or of another version.
-    """
+    """Return the card of a file of demonstrations; None if it has none."""
     file = card_file(path)
     if not file.exists():
         return None
@@ -324,11 +312,7 @@ def _checksums(path: Path) -> dict[str, tuple[int, int]]:
 
 
 def check_files(path: Path, card: Card) -> None:
-    """Check that an export consists of the files of its card, unaltered.
-
-    Raises:
-        DamagedFilesError: a file is missing, shorter or altered.
-    """
+    """Check that an export consists of the files of its card, unaltered."""
     for name, (size, checksum) in card.checksums.items():
         file = path / name
         if not file.is_file():
@@ -341,11 +325,7 @@ def check_files(path: Path, card: Card) -> None:
 
 
 def read_file(form: Format, path: Path) -> list[StoredArrays]:
-    """Return the episodes of a file, with all of its entries by name.
-
-    Raises:
-        ConfigError: it is damaged, or a package is missing.
-    """
+    """Return the episodes of a file, with all of its entries by name."""
     try:
         episodes = form.read(path)
         last_file = path / _LAST_FILE
@@ -364,11 +344,7 @@ def read_file(form: Format, path: Path) -> list[StoredArrays]:
 
 
 def entry_of(arrays: StoredArrays, name: str) -> np.ndarray | Rows:
-    """Return an entry of a file.
-
-    Raises:
-        ConfigError: the file has none of that name, or it cannot be used.
-    """
+    """Return an entry of a file."""
     if name not in arrays:
         raise ConfigError(f"there is no {name!r}. Known: {', '.join(sorted(arrays))}")
     if fault := getattr(arrays[name], "fault", ""):
@@ -377,11 +353,7 @@ def entry_of(arrays: StoredArrays, name: str) -> np.ndarray | Rows:
 
 
 def plain(values: Any) -> np.ndarray:
-    """Return an array of numbers or of text, which libraries also return as bytes and objects.
-
-    Raises:
-        ConfigError: there are other objects.
-    """
+    """Return an array of numbers or of text, which libraries also return as bytes and objects."""
     array = np.asarray(values)
     if array.dtype.kind == "T":
         return array.astype(str)
@@ -447,11 +419,7 @@ class Source(StrictModel):
         return float(given) if isinstance(given, str) else given
 
     def values(self, found: np.ndarray) -> np.ndarray:
-        """Return the values of an entry of an episode, from those in the file.
-
-        Raises:
-            ConfigError: there are fewer components.
-        """
+        """Return the values of an entry of an episode, from those in the file."""
         try:
             if self.components is not None:
                 if found.ndim < 2:
@@ -471,11 +439,7 @@ class DemonstrationMapping(StrictModel):
 
     @classmethod
     def parse(cls, mapping: str | Path | Mapping[str, Any]) -> DemonstrationMapping:
-        """Return a mapping that is given as a YAML file or as its values.
-
-        Raises:
-            ConfigError: the file cannot be read, or a value is wrong.
-        """
+        """Return a mapping that is given as a YAML file or as its values."""
         what: Any = "mapping"
         if not isinstance(mapping, Mapping):
             what, mapping = mapping, _read_yaml(Path(mapping))

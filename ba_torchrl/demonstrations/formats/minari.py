@@ -145,11 +145,7 @@ class Minari(Format):
 
 
 def _check_space(folder: Path, episodes: Sequence[Arrays]) -> None:
-    """Check that the disk has room: HDF5 ends the process if its file cannot grow.
-
-    Raises:
-        OSError: it has not.
-    """
+    """Check that the disk has room: HDF5 ends the process if its file cannot grow."""
     needed = sum(values.nbytes + _OVERHEAD for arrays in episodes for values in arrays.values())
     free = shutil.disk_usage(folder).free
     if free < needed + _EMPTY:

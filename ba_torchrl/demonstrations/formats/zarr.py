@@ -60,11 +60,7 @@ class DiffusionPolicy(Format):
             meta.attrs[keys.INSTRUCTION] = [str(arrays[keys.INSTRUCTION][0]) for arrays in episodes]
 
     def read(self, path: Path) -> list[StoredArrays]:
-        """Return every array below ``data``, cut at the ends of the episodes.
-
-        Raises:
-            ConfigError: the ends are damaged.
-        """
+        """Return every array below ``data``, cut at the ends of the episodes."""
         zarr, is_zip = self.library("zarr"), path.is_file()
         store = self.library("zarr.storage").ZipStore(str(path), mode="r") if is_zip else str(path)
         files = zipfile.Path(path) if is_zip else path

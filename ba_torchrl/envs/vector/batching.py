@@ -114,9 +114,6 @@ class Vector(ChecksPolicy, EnvBase):
 
         Returns:
             The seed for the next environment, such as the first one of another vector.
-
-        Raises:
-            ValueError: ``seed`` is not a natural number.
         """
         if seed is not None:
             check_seed(seed)
@@ -126,23 +123,14 @@ class Vector(ChecksPolicy, EnvBase):
         return seed
 
     def set_consecutive_seeds(self, seed: int) -> None:
-        """Seed environment i with ``seed + i``, as ``reset(seed=seed)`` does.
-
-        Raises:
-            ValueError: ``seed`` is not a natural number.
-        """
+        """Seed environment i with ``seed + i``, as ``reset(seed=seed)`` does."""
         check_seed(seed)
         self._base_seed = int(seed)
         for index in range(self.num_workers):
             self._seed_one(index, int(seed) + index, True)
 
     def get_positions(self) -> list[Position]:
-        """Return the position of each environment in its episodes; see `RecordedPosition`.
-
-        Raises:
-            WorkerError: a worker has failed, or the environments were not reset.
-            SimulationError: the environments of this process were not reset.
-        """
+        """Return the position of each environment in its episodes; see `RecordedPosition`."""
         return self._call_each("get_position", [()] * self.num_workers)
 
     def continue_from(self, positions: Sequence[Position]) -> None:
@@ -150,9 +138,6 @@ class Vector(ChecksPolicy, EnvBase):
 
         Args:
             positions: of as many environments of the same task and parameters.
-
-        Raises:
-            WorkerError: a worker has failed.
         """
         self._call_each("continue_from", [(position,) for position in positions])
 
@@ -275,10 +260,6 @@ class SerialVectorEnv(Vector):
 
 
 def check_seed(seed: int) -> None:
-    """Check a seed.
-
-    Raises:
-        ValueError: it is not a natural number.
-    """
+    """Check that a seed is a natural number."""
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"a seed must be a natural number, got {seed!r}")

@@ -86,11 +86,7 @@ def make_vector(
 
 
 def _check_shared_memory(env: Vector) -> None:
-    """Check the space for the observations of all workers; too little would end this process.
-
-    Raises:
-        ConfigError: there is not enough.
-    """
+    """Check the space for the observations of all workers; too little would end this process."""
     if not _SHARED_MEMORY.is_dir():
         return
     needed = sum(value.nbytes for value in env.fake_tensordict()["next"].values(True, True))

@@ -60,9 +60,6 @@ class VectorEnv(Vector):
         num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
         workers: how processes start and when they are replaced.
-
-    Raises:
-        ValueError: the environments lack a ``truncated`` or a ``fault`` entry.
     """
 
     def __init__(
@@ -217,12 +214,7 @@ class VectorEnv(Vector):
         return [value for value, _ in answers], answers[0][1]
 
     def _ask_all(self, commands: Sequence[Command], timeout_s: float | None = None) -> list[Any]:
-        """Return the answer of each worker.
-
-        Raises:
-            WorkerError: a worker has failed.
-            Exception: an environment raised it.
-        """
+        """Return the answer of each worker."""
         if self.is_closed:
             self.start()
         self._finish_starts(wait_for_all=True)
@@ -324,9 +316,6 @@ class VectorEnv(Vector):
         Args:
             causes: why each worker is replaced, by index.
             attempts: number of failed attempts to start the worker.
-
-        Raises:
-            RuntimeError: there were too many.
         """
         for index, cause in causes.items():
             self._check_limit(index, attempts, "starting", cause)
@@ -346,10 +335,6 @@ class VectorEnv(Vector):
 
         Args:
             wait_for_all: wait until every worker is ready.
-
-        Raises:
-            RuntimeError: too many attempts to start a worker failed.
-            ConfigError: the constructor of an environment raised it.
         """
         is_any = True
         while self._starts and (wait_for_all or is_any):

@@ -172,11 +172,7 @@ class Worker:
         return answer
 
     def check(self) -> None:
-        """Check that the process runs.
-
-        Raises:
-            WorkerError: it has ended.
-        """
+        """Check that the process runs."""
         if self.process.exitcode is not None:
             self._raise_exit()
 
@@ -318,9 +314,6 @@ def start_process(process: BaseProcess) -> None:
 
     Args:
         process: not started yet.
-
-    Raises:
-        OSError: the process cannot be started.
     """
     if threading.current_thread() is threading.main_thread():
         process.start()

@@ -47,9 +47,6 @@ class ActionFields:
     Args:
         action_sequence: one letter per component.
         has_reflections: whether the group contains reflections.
-
-    Raises:
-        ValueError: x or y is missing.
     """
 
     def __init__(self, action_sequence: str, *, has_reflections: bool = False) -> None:
@@ -102,9 +99,6 @@ class PoseFields:
     Args:
         spec: vectors of the observation, and the centre.
         has_reflections: whether the group contains reflections.
-
-    Raises:
-        ConfigError: another vector than ``proprio`` is observed.
     """
 
     def __init__(self, spec: ActorCriticSpec, *, has_reflections: bool = False) -> None:

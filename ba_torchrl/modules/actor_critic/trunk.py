@@ -29,9 +29,6 @@ def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int,
     Args:
         image_size: pixels, 64 or 128.
         widths: the seven widths of the 128 px trunk.
-
-    Raises:
-        ValueError: another image size.
     """
     if image_size not in SUPPORTED_IMAGE_SIZES:
         raise ValueError(
@@ -85,11 +82,7 @@ class ImageNetworkConfig(StrictModel):
         return image_channels + (1 if self.depth_reference == "camera" else 2)
 
     def check_images(self, spec: ActorCriticSpec) -> None:
-        """Refuse images that are not depth or height.
-
-        Raises:
-            ValueError: an image has several channels, or values below zero.
-        """
+        """Refuse images that are not depth or height, nothing below zero, in one channel."""
         for key, image in spec.images.items():
             if image.channels != 1 or image.low < 0:
                 raise ValueError(

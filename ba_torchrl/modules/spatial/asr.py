@@ -85,11 +85,7 @@ class ASR(SpatialQNetwork):
         return values.squeeze(1), ASRState(heightmap, in_hand, holding, scene)
 
     def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
-        """Return the Q values [B, n] of a component, given the choices [B, m] before it.
-
-        Raises:
-            ValueError: there is no such level.
-        """
+        """Return the Q values [B, n] of a component, given the choices [B, m] before it."""
         if not 1 <= level < len(self.levels):
             raise ValueError(
                 f"the later levels of this network are 1 to {len(self.levels) - 1}, got {level}"
@@ -112,11 +108,7 @@ class ASRNetworkConfig(SpatialImageConfig):
     patch_size: int | None = Field(default=None, ge=1)
 
     def _planar_layout(self, name: str, spec: SpatialSpec) -> tuple[tuple[Level, Level], int]:
-        """Return the levels of pixels and yaws, and the patch's size.
-
-        Raises:
-            ValueError: a size does not fit.
-        """
+        """Return the levels of pixels and yaws, and the patch's size."""
         require_unet_size(name, spec.image_size)
         patch_size = self.patch_size or spec.in_hand_size
         if (patch_size - spec.in_hand_size) % 2:
@@ -140,9 +132,6 @@ class PlainYawValues(nn.Module):
         num_yaws: number of yaws.
         patch_size: rows and columns of the patch.
         scene_channels: channels of the scene map.
-
-    Raises:
-        ValueError: the patch is too small.
     """
 
     def __init__(

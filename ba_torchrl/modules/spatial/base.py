@@ -32,9 +32,6 @@ class SpatialSpec:
             subset of x, y, z, rz, ry, rx.
         half_rotation: whether yaws half a turn apart are equivalent.
         side_m: edge of the square workspace, which the heightmap covers.
-
-    Raises:
-        ValueError: x or y is missing.
     """
 
     images: Mapping[str, ImageSpec]
@@ -205,11 +202,7 @@ def has_yaw(name: str, spec: SpatialSpec) -> bool:
 
 
 def require_yaw(name: str, spec: SpatialSpec) -> None:
-    """Refuse an action without yaw.
-
-    Raises:
-        ValueError: the action has no yaw, or has components other than x, y and rz.
-    """
+    """Refuse an action without yaw."""
     if not has_yaw(name, spec):
         raise ValueError(
             f"network {name!r} chooses a yaw, and the action has no rz; use 'fcn' or 'equi_fcn', "
@@ -218,11 +211,7 @@ def require_yaw(name: str, spec: SpatialSpec) -> None:
 
 
 def require_unet_size(name: str, image_size: int) -> None:
-    """Refuse images that a UNet cannot halve four times.
-
-    Raises:
-        ValueError: the size is not a multiple of 16 pixels.
-    """
+    """Refuse images that a UNet cannot halve four times."""
     if image_size % UNET_STRIDE:
         raise ValueError(
             f"network {name!r} needs an obs_size that is a multiple of {UNET_STRIDE}, got "

@@ -119,10 +119,6 @@ class EquivariantYawValues(nn.Module):
         patch_size: rows and columns of the patch.
         make_scene: returns the layers from the scene feature map to a vector, with
             ``out_features``.
-
-    Raises:
-        ValueError: the patch size is not 24 or 40, or the size of the in-hand image is not
-            supported.
     """
 
     def __init__(

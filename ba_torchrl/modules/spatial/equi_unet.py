@@ -95,9 +95,6 @@ class EquivariantPixelValues(nn.Module):
             value, a representation on yaws for one value per yaw.
         spec: shapes of the images.
         config: width, precision, units.
-
-    Raises:
-        ValueError: the in-hand image is too small or too large.
     """
 
     def __init__(

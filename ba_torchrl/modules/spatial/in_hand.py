@@ -18,9 +18,6 @@ class InHandMap(nn.Module):
         channels: of the image.
         size: of the image, pixels.
         width: factor on the layers' widths, 64, 128 and 256.
-
-    Raises:
-        ValueError: the image is smaller than 10 pixels.
     """
 
     def __init__(self, channels: int, size: int, width: float) -> None:
@@ -50,9 +47,6 @@ class InHandVector(nn.Module):
         size: of the image, pixels.
         width: factor on the convolutions' widths, 32, 64, 128 and 256.
         out_features: width of the linear layer.
-
-    Raises:
-        ValueError: the image is too small or too large for two or three pools.
     """
 
     def __init__(self, channels: int, size: int, width: float, out_features: int) -> None:

@@ -30,10 +30,6 @@ class SpatialActions:
         actions: the environment's action vector.
         levels: the levels of choices, in their order.
         limits: first and last value on the grids of z and the tilts, see `OpenLoopActions.axis`.
-
-    Raises:
-        ValueError: the components of the levels are not those of the action, or the limits exceed
-            its bounds.
     """
 
     def __init__(

@@ -35,9 +35,6 @@ class SceneMapVector(nn.Module):
         image_size: rows and columns of the heightmap.
         config: widths of the layers, 128, 1024 and 512 in the reference's size.
         copies: number of copies of each channel that the convolution sees.
-
-    Raises:
-        ValueError: the image is smaller than 32 pixels.
     """
 
     def __init__(
@@ -78,9 +75,6 @@ class PoseValues(nn.Module):
         values_per_view: values of each view and primitive.
         patch_size: rows and columns of a view.
         scene: from the scene feature map to a vector, with ``out_features``.
-
-    Raises:
-        ValueError: the views are smaller than 8 pixels.
     """
 
     def __init__(

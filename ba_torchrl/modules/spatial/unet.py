@@ -92,9 +92,6 @@ class PlainPixelValues(nn.Module):
         spec: shapes of the images.
         config: width, precision, units.
         maps: values per pixel and primitive.
-
-    Raises:
-        ValueError: the in-hand image is too small.
     """
 
     def __init__(self, spec: SpatialSpec, config: SpatialImageConfig, maps: int) -> None:

@@ -351,9 +351,6 @@ def irrep_convolution(
         coefficients: [out, in, D], of the kernels.
         bias: [out * N].
         padding: zeros added on each side, pixels; at most 2.
-
-    Raises:
-        ValueError: there are no images, or the padding is too large.
     """
     if not len(x) or padding > 2:
         raise ValueError(f"got {len(x)} images, padded by {padding}; the padding is at most 2")

@@ -58,20 +58,12 @@ def reuse_filters() -> Iterator[None]:
 
 
 def planar_rotations(order: int) -> GSpace2D:
-    """Return escnn's space of planar images under the rotations of the cyclic group C_order.
-
-    Raises:
-        ImportError: escnn is not installed; the message names the fix.
-    """
+    """Return escnn's space of planar images under the rotations of the cyclic group C_order."""
     return import_escnn("escnn.gspaces").rot2dOnR2(order)
 
 
 def planar_rotations_and_flips(order: int) -> GSpace2D:
-    """Return escnn's space of planar images under the dihedral group D_order of 2 order elements.
-
-    Raises:
-        ImportError: escnn is not installed; the message names the fix.
-    """
+    """Return escnn's space of planar images under the dihedral group of 2 order elements."""
     return import_escnn("escnn.gspaces").flipRot2dOnR2(order)
 
 
@@ -86,9 +78,6 @@ def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representati
     Args:
         count: number of yaws, evenly spaced.
         half_rotation: whether the yaws span half a turn.
-
-    Raises:
-        ImportError: escnn is not installed; the message names the fix.
     """
     if half_rotation:
         gspace = planar_rotations(2 * count)
@@ -112,10 +101,6 @@ class SteerableConv2d(nn.Module):
         padding: zeros added on each side, pixels.
         stride: distance between output pixels, in input pixels.
         bias: one bias per trivial irrep of the output.
-
-    Raises:
-        ValueError: a representation is listed twice, a multiplicity is below one, or no kernel
-            maps ``in_types`` to ``out_types``.
     """
 
     def __init__(

@@ -36,9 +36,6 @@ class ObjectSet(Sequence[Solid], ABC):
 
     Args:
         asset_root: folder of the user's meshes, for object sets that read one.
-
-    Raises:
-        ConfigError: the folder is missing, or the object set does not read one.
     """
 
     mass_kg: ClassVar[float] = 0.15
@@ -88,11 +85,7 @@ class ObjectSet(Sequence[Solid], ABC):
 
 
 def load_object_set(name: str, asset_root: str | None = None) -> ObjectSet:
-    """Return an object set by its name in `OBJECT_SETS`; "graspnet" reads ``asset_root``.
-
-    Raises:
-        ConfigError: the name is unknown, or the folder is missing or not readable.
-    """
+    """Return an object set by its name in `OBJECT_SETS`; "graspnet" reads ``asset_root``."""
     return _packaged_set(name) if asset_root is None else OBJECT_SETS[name](asset_root)
 
 

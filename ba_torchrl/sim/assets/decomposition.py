@@ -211,9 +211,6 @@ def _vhacd(mesh: Mesh, path: Path) -> list[Mesh]:
     """Return the convex parts of a mesh at unit size.
 
     A process of its own computes them: the C code can crash, and prints its progress.
-
-    Raises:
-        ConfigError: the process fails, or takes longer than `VHACD_LIMIT_S`.
     """
     logger.info("decomposing %s into convex parts; the result is cached", path)
     with tempfile.TemporaryDirectory() as folder:

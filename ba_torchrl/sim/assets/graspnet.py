@@ -68,9 +68,6 @@ class GraspNet(ObjectSet):
     At its first use, a mesh is decomposed into convex parts, which takes seconds; the parts are
     cached on disk. Holes of its surface are closed with flat faces where they leave the object
     hollow, and a warning tells so.
-
-    Raises:
-        ConfigError: the folder or a mesh file is missing or cannot be read.
     """
 
     def __init__(self, asset_root: str | None = None) -> None:
@@ -98,11 +95,7 @@ class GraspNet(ObjectSet):
         return [path.parent.name for path in self.paths]
 
     def parts(self, index: int) -> tuple[Mesh, ...]:
-        """Return the convex parts of a mesh, scaled.
-
-        Raises:
-            ConfigError: the file cannot be read, or its mesh does not satisfy the limits.
-        """
+        """Return the convex parts of a mesh, scaled."""
         path = self.paths[index]
 
         def decompose() -> Decomposition:
@@ -141,12 +134,7 @@ def graspable_scale(extents_m: Sequence[float]) -> float:
 
 
 def check_size(mesh: Mesh, path: Path, max_length_m: float = MAX_LENGTH_M) -> None:
-    """Check that a mesh is a solid that fits into the tray at its graspable scale.
-
-    Raises:
-        ConfigError: the mesh is flat, its length is outside of `MESH_LENGTHS_M`, or its scaled
-            length exceeds ``max_length_m``.
-    """
+    """Check that a mesh is a solid that fits into the tray at its graspable scale."""
     extents = _principal_extents(mesh.vertices)
     thinnest, _, longest = extents
     measured = f"asset_root: {str(path)!r} measures {_format_extents(extents)}"
@@ -175,11 +163,7 @@ def _num_factors(ratio: float, factor: float) -> int:
 
 
 def read_mesh(path: Path) -> Mesh:
-    """Return the mesh in a file, relative to the centre of its bounding box.
-
-    Raises:
-        ConfigError: the file contains too few triangles or coordinates that are not finite.
-    """
+    """Return the mesh in a file, relative to the centre of its bounding box."""
     try:
         with _as_config_error(path):
             content = path.read_bytes()
@@ -227,11 +211,7 @@ def _format_extents(extents_m: np.ndarray) -> str:
 
 
 def _mesh_file(folder: Path) -> Path:
-    """Return the mesh file of a sub-folder.
-
-    Raises:
-        ConfigError: there is no mesh file, or the path is not a file.
-    """
+    """Return the mesh file of a sub-folder."""
     names = {name: i for i, name in enumerate(PREFERRED_NAMES)}
     with _as_config_error(folder):
         meshes = [

@@ -108,11 +108,7 @@ class CloseLoopController:
         """Whether the last motion ended where its path left the reach of the arm."""
 
     def reset(self, pose: YawPose, opening: float = 1.0) -> None:
-        """Teleport the tool to a pose, without simulation.
-
-        Raises:
-            ValueError: the pose is out of reach.
-        """
+        """Teleport the tool to a pose, without simulation."""
         joints = self.robot.inverse_kinematics(pose[0], downward(pose[1]))
         if joints is None:
             raise ValueError(f"{pose[0]} m is out of the robot's reach")

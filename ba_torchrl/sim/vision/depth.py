@@ -295,9 +295,6 @@ def point_cloud(
     equally often, up to one. Those outside of ``bounds_m``, ranges of x, y and z, are omitted; the
     lower bound of z is ignored, so that the floor is included where the workspace starts above it.
     The same scene gives the same points.
-
-    Raises:
-        ValueError: the cameras see nothing inside the bounds.
     """
     pixels = min(max(math.ceil(math.sqrt(2 * count)), 128), 512)
     x, y, z = bounds_m
