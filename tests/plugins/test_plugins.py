@@ -347,21 +347,19 @@ def test_a_benchmark_with_a_plugin_runs_its_jobs(folder):
 
 
 @pytest.mark.slow
-def test_the_other_recipes_take_a_plugin(folder):
-    recipes = ROOT / "recipes"
-    demos = ("task=mine/reach_near", "episodes=2", "num_envs=1", "env.obs_size=16", "path=demos")
-    out = run(folder, recipes / "collect.py", PLUGIN, *demos).stdout
+def test_other_commands_take_a_plugin(folder):
+    def command(*words):
+        return run(folder, "-m", "ba_torchrl", *words, PLUGIN).stdout
+
+    task = ("task=mine/reach_near", "env.obs_size=16")
+    out = command("collect", *task, "episodes=2", "num_envs=1", "path=demos")
     assert "episodes of mine/reach_near" in out
-    out = run(
-        folder, recipes / "play.py", PLUGIN, "task=mine/reach_near", "video=null", "env.obs_size=16"
-    ).stdout
-    assert "1 episodes of mine/reach_near" in out
+    assert "1 episodes of mine/reach_near" in command("play", *task, "video=null")
     tasks = "tasks=[mine/reach_near]"
-    out = run(
-        folder, recipes / "experts.py", PLUGIN, tasks, "robots=[mine/kuka]", "episodes=2"
-    ).stdout
+    out = command("experts", tasks, "robots=[mine/kuka]", "episodes=2")
     assert "| `mine/reach_near` | mine/kuka |" in out
-    run(folder, recipes / "gallery.py", PLUGIN, tasks, "deconstructions=[]", "overview=null")
+    gallery = (ROOT / "recipes" / "gallery.py", PLUGIN, tasks)
+    run(folder, *gallery, "deconstructions=[]", "overview=null")
     assert (folder / "runs/gallery/mine_reach_near.png").exists()
 
 
