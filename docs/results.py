@@ -27,7 +27,7 @@ from ba_torchrl.record.leaderboard import (
     package_runs,
     read_records,
 )
-from ba_torchrl.record.report import pipes, plot_groups
+from ba_torchrl.record.report import plot_groups
 from ba_torchrl.record.summary import (
     GOOD_RATE,
     Group,
@@ -36,6 +36,7 @@ from ba_torchrl.record.summary import (
     compare,
     grouped,
     load_runs,
+    pipes,
 )
 from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
@@ -105,13 +106,10 @@ def page_with_results(text: str) -> str:
 def _question(section: Section) -> Iterator[str]:
     """Yield the lines of the answer to a question."""
     yield f"![Success over environment steps](results/{section.title}.svg)\n"
-    ends = {
-        task: max(group.env_steps for group in section.groups if group.task == task)
-        for task in section.tasks
-    }
-    yield from pipes(COMPARED, (_compared_cells(each, ends[each.task]) for each in section.groups))
+    rows = (_compared_cells(group, section.end(group.task)) for group in section.groups)
+    yield from pipes(COMPARED, *rows)
     yield ""
-    yield from pipes(DIFFERENCES, (_difference(row) for row in compare(section)))
+    yield from pipes(DIFFERENCES, *map(_difference, compare(section)))
     yield ""
     yield _origin([run for group in section.groups for run in group.runs])
 
@@ -141,7 +139,7 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
         yield from ("Left out:", "", *(f"- {run}" for run in board.left_out), "")
     for heading, tasks in tasks_by_heading(board.tasks).items():
         yield f"### {heading}\n"
-        yield from pipes(HEADER, (row for task in tasks for row in _rows(board, task)))
+        yield from pipes(HEADER, *(row for task in tasks for row in _rows(board, task)))
         yield ""
     if board.cells:
         yield _origin([run for group in board.cells.values() for run in group.runs])

@@ -11,7 +11,7 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, PluginSettings, PngFile
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.record.plots import plot_learning_curve
+from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.training.checkpoint import read_config
 
 RATE, ERROR = "eval/success_rate", "eval/standard_error"
@@ -35,17 +35,13 @@ def main(settings: Settings) -> None:
         config = read_config(run, device="cpu")  # that of the run may not be here
         name = f"{config.label}, {config.task.split('/')[-1]}, seed {config.seed}"
         curves[name] = _curve(run)
+    panels = {settings.title: {name: Learning(curve) for name, curve in curves.items()}}
+    ylabel = "success rate of the greedy policy"
     try:
-        path = plot_learning_curve(
-            curves,
-            settings.path,
-            title=settings.title,
-            xlabel="updates",
-            ylabel="success rate of the greedy policy",
-        )
+        plot_panels(panels, [settings.path], names=list(curves), ylabel=ylabel, panel_in=(5, 3.6))
     except ValueError as error:  # such as a title with an incomplete formula
         raise ConfigError(f"cannot draw the curves: {error}") from None
-    print(path)
+    print(settings.path)
 
 
 def _curve(run: str) -> tuple[np.ndarray, ...]:

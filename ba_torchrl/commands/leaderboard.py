@@ -17,9 +17,8 @@ from ba_torchrl.cli.types import Folders, PluginSettings
 from ba_torchrl.commands.report import completed
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.leaderboard import LEGEND, Leaderboard, leaderboard, package_runs
-from ba_torchrl.record.report import pipes
 from ba_torchrl.record.results import why_unfinished
-from ba_torchrl.record.summary import load_runs
+from ba_torchrl.record.summary import load_runs, pipes
 
 
 class Settings(PluginSettings):
@@ -36,7 +35,7 @@ def main(settings: Settings) -> None:
     board, unfinished = read(settings.runs or ())
     rows = board.rows()
     if settings.format == "markdown":
-        print("\n".join(pipes(rows[0], rows[1:])))
+        print("\n".join(pipes(*rows)))
     else:
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         for row in rows:

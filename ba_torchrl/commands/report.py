@@ -19,8 +19,8 @@ from ba_torchrl.commands import benchmark as benchmark_command
 from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.report import write_report
-from ba_torchrl.record.results import NON_LEARNING_FIELDS, RunResult, differences, run_folders
-from ba_torchrl.record.summary import Axis
+from ba_torchrl.record.results import NON_LEARNING_FIELDS, RunResult, differences
+from ba_torchrl.record.summary import Axis, load_sections
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import expand, split
@@ -40,12 +40,9 @@ class Settings(StrictModel):
 def main(settings: Settings) -> None:
     """Write the report and print its tables."""
     folder = Path(settings.folder or Path(settings.runs[0]) / "report")
-    if not run_folders(settings.runs)[0]:
-        raise ConfigError(f"no finished run below {', '.join(settings.runs)}")
+    runs = load_sections(settings.runs, changes, completed)
     check_writable_folder(folder)
-    page = write_report(
-        settings.runs, folder, axis=settings.axis, changes=changes, completed=completed
-    )
+    page = write_report(*runs, folder, settings.axis)
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
     tables = "table.md, table.tex, comparisons.csv; by seed seeds.csv, curves.csv"

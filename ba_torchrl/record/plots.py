@@ -6,21 +6,16 @@ import math
 import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure  # no pyplot: it holds figures in a global list
+from matplotlib.lines import Line2D
+from numpy.typing import ArrayLike
 
-from ba_torchrl.core.errors import MissingPackageError, install_command
 from ba_torchrl.core.files import replaced
-from ba_torchrl.record.logging import read_scalars
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.lines import Line2D
-    from numpy.typing import ArrayLike
-
-    Curve = Sequence[ArrayLike]
 
 # Distinguishable by colour-blind readers (Okabe and Ito), in order of decreasing contrast.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -35,48 +30,12 @@ _LABEL_WIDTH = 24
 class Learning(NamedTuple):
     """A method in a panel."""
 
-    curve: Curve
-    """As for `plot_learning_curve`."""
-    runs: Sequence[Curve] = ()
+    curve: Sequence[ArrayLike]
+    """(x, y), or (x, y, low, high) with the limits of a band, [n] each."""
+    runs: Sequence[Sequence[ArrayLike]] = ()
     """(x, y) of each run, drawn as thin lines."""
     demonstration_steps: float = 0.0
     """Length of a dotted line to the left of 0."""
-
-
-def plot_learning_curve(
-    curves: Mapping[str, Curve] | str | Path,
-    path: str | Path,
-    *,
-    title: str = "",
-    xlabel: str = "updates",
-    ylabel: str = "success rate",
-    ylim: tuple[float, float] | None = (0.0, 1.0),
-) -> Path:
-    """Plot curves into a PNG, with optional error bands, and return its path.
-
-    Args:
-        curves: by name, (x, y) or (x, y, low, high), each [n]; low and high bound the band, for
-            example mean minus and plus standard error. Or the ``scalars.csv`` of a run, of which
-            the success rates are plotted.
-        ylim: limits of the y axis; None for automatic limits.
-
-    Raises:
-        ImportError: matplotlib is missing.
-        ValueError: there is no curve, or the parts of one differ in length.
-    """
-    figure = _figure((7, 4.5))
-    if isinstance(curves, str | Path):
-        scalars = read_scalars(curves)
-        curves = {name: scalars[name] for name in scalars if name.endswith("success_rate")}
-    if not curves:
-        raise ValueError("there is no curve to draw")
-    axes = figure.add_subplot()
-    for number, (name, curve) in enumerate(curves.items()):
-        _draw(axes, number, name, curve)
-    axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
-    _style_axes(axes, ylim)
-    axes.legend(frameon=False, loc="best")
-    return _save(figure, path)
 
 
 def plot_panels(
@@ -86,6 +45,7 @@ def plot_panels(
     names: Sequence[str],
     xlabel: str = "updates",
     ylabel: str = "success rate",
+    panel_in: tuple[float, float] = (2.5, 1.8),
 ) -> None:
     """Plot rates into a grid of panels, as in the paper's figures 18 to 22.
 
@@ -96,33 +56,22 @@ def plot_panels(
         paths: of the figure in several formats, such as ``.svg`` and ``.pdf``.
         names: names of all curves, in the order of colours and markers; a name has the same ones in
             all panels.
-
-    Raises:
-        ImportError: matplotlib is missing.
-        ValueError: there is no panel, a name is not in ``names``, or the parts of a curve differ
-            in length.
+        panel_in: width and least height of a panel.
     """
-    if not panels:
-        raise ValueError("there is no panel to draw")
     columns = min(min((4, 3), key=lambda n: -len(panels) % n), len(panels))
     rows = math.ceil(len(panels) / columns)
     labels = {name: textwrap.wrap(name, _LABEL_WIDTH) for name in names}
     gap_in = 1.3 * _LABEL_PT / 72 * max(map(len, labels.values()), default=1)
-    height_in = max(1.8, gap_in * max(map(len, panels.values())))
+    height_in = max(panel_in[1], gap_in * max(map(len, panels.values())))
     longest = max((len(line) for lines in labels.values() for line in lines), default=0)
-    figure = _figure((columns * (2.5 + 0.6 * _LABEL_PT / 72 * longest), rows * (height_in + 0.7)))
+    width_in = panel_in[0] + 0.6 * _LABEL_PT / 72 * longest
+    size_in = columns * width_in, rows * (height_in + 0.7)
+    figure = Figure(figsize=size_in, dpi=150, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
         ends = []
         for name, method in curves.items():
-            line = _draw(axes, list(names).index(name), name, method.curve)
-            thin = {"color": line.get_color(), "linewidth": 0.5, "alpha": 0.6}
-            for run in method.runs:
-                axes.plot(*run, **thin)
-            if method.demonstration_steps and line.get_xdata().size:
-                (x, y), *_ = line.get_xydata()
-                before = [-method.demonstration_steps, x], [y, y]
-                axes.plot(*before, color=line.get_color(), linewidth=1.0, linestyle=":")
+            line = _draw(axes, list(names).index(name), method)
             label = "\n".join(labels[name])
             ends += [(x, y, line, label) for x, y in line.get_xydata()[-1:]]
         _label(axes, ends, gap_in / height_in)
@@ -132,15 +81,43 @@ def plot_panels(
         if before:
             axes.axvspan(-1.05 * before, 0, color="0.95", zorder=0)
             axes.xaxis.set_major_formatter(lambda x, _: f"{abs(x):g}")
-        _style_axes(axes, (0.0, 1.0))
+        axes.set_ylim(-0.02, 1.02)  # keeps lines at the limits visible
+        axes.grid(alpha=0.3)
+        axes.spines[["top", "right"]].set_visible(False)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     demonstrated = any(each.demonstration_steps for of in panels.values() for each in of.values())
     xlabel += "; dotted, left of 0: steps of demonstrations" if demonstrated else ""
     figure.supxlabel(xlabel, fontsize=10)
     figure.supylabel(ylabel, fontsize=10)
-    for path in paths:
-        _save(figure, path)
+    for path in map(Path, paths):
+        metadata = {"Date": None} if path.suffix == ".svg" else None
+        # the same file for the same curves
+        with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
+            figure.savefig(scratch, metadata=metadata)
+
+
+def _draw(axes: Axes, number: int, method: Learning) -> Line2D:
+    """Draw a method, whose colour and marker are those of a number; return the line of its mean."""
+    x, y, *band = (np.asarray(part, dtype=float) for part in method.curve)
+    color = _COLORS[number % len(_COLORS)]
+    (line,) = axes.plot(
+        x,
+        y,
+        color=color,
+        linestyle=_STYLES[number // len(_COLORS) % len(_STYLES)],
+        marker=_MARKERS[number % len(_MARKERS)],
+        markersize=3.5,
+        markevery=math.ceil(x.size / _MOST_MARKERS),
+    )
+    if band:
+        axes.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)
+    for run in method.runs:
+        axes.plot(*run, color=color, linewidth=0.5, alpha=0.6)
+    if method.demonstration_steps and x.size:
+        before = [-method.demonstration_steps, x[0]], [y[0], y[0]]
+        axes.plot(*before, color=color, linewidth=1.0, linestyle=":")
+    return line
 
 
 def _label(axes: Axes, ends: Sequence[tuple[float, float, Line2D, str]], gap: float) -> None:
@@ -162,56 +139,3 @@ def _label(axes: Axes, ends: Sequence[tuple[float, float, Line2D, str]], gap: fl
         leader = {"arrowstyle": "-", "color": color, "lw": 0.5, "shrinkA": 0}
         axes.annotate("", (x, y), (1.05, height), textcoords=beside, arrowprops=leader)
         axes.text(1.09, height, label, transform=beside, va="center", fontsize=_LABEL_PT)
-
-
-def _figure(size_in: tuple[float, float]) -> Figure:
-    try:
-        from matplotlib.figure import Figure  # no pyplot: it holds figures in a global list
-    except ImportError as error:
-        fix = f"drawing curves needs {install_command('matplotlib')}"
-        raise MissingPackageError(fix) from error
-    return Figure(figsize=size_in, dpi=150, layout="constrained")
-
-
-def _style_axes(axes: Axes, ylim: tuple[float, float] | None) -> None:
-    if ylim is not None:
-        margin = 0.02 * (ylim[1] - ylim[0])  # keeps lines at the limits visible
-        axes.set_ylim(ylim[0] - margin, ylim[1] + margin)
-    axes.grid(alpha=0.3)
-    axes.spines[["top", "right"]].set_visible(False)
-
-
-def _save(figure: Figure, path: str | Path) -> Path:
-    path = Path(path)
-    from matplotlib import rc_context
-
-    metadata = {"Date": None} if path.suffix == ".svg" else None
-    # the same file for the same curves
-    with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
-        figure.savefig(scratch, metadata=metadata)
-    return path
-
-
-def _draw(axes: Axes, number: int, name: str, curve: Curve) -> Line2D:
-    parts = [np.asarray(part, dtype=float) for part in curve]
-    if len(parts) not in (2, 4) or any(part.shape != (parts[0].size,) for part in parts):
-        raise ValueError(
-            f"curve {name!r} is not x, y or x, y, low, high of one length: "
-            f"got shapes {[list(part.shape) for part in parts]}"
-        )
-    x, y, *band = parts
-    color = _COLORS[number % len(_COLORS)]
-    style = _STYLES[number // len(_COLORS) % len(_STYLES)]
-    (line,) = axes.plot(
-        x,
-        y,
-        color=color,
-        linestyle=style,
-        marker=_MARKERS[number % len(_MARKERS)],
-        markersize=3.5,
-        markevery=math.ceil(x.size / _MOST_MARKERS),
-        label=name,
-    )
-    if band:
-        axes.fill_between(x, *band, color=color, alpha=0.2, linewidth=0)
-    return line

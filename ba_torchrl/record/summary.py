@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import itertools
 import logging
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
@@ -45,7 +46,7 @@ by name."""
 Completed = Callable[[RunResult], RunResult]
 """Fills in the defaults of settings that are newer than the run."""
 
-POOLED = {
+POOLED: Mapping[str, Callable[[RunResult], object]] = {
     "task version": lambda run: run.task_version,
     "expert version": lambda run: run.expert_version,
     "protocol": lambda run: run.protocol,
@@ -71,6 +72,21 @@ class Run:
 
     folder: Path
     result: RunResult
+
+    @property
+    def hours(self) -> float:
+        """Wall time, nan of a policy from a file."""
+        return math.nan if self.result.seconds is None else self.result.seconds / 3600
+
+    def differences(self, other: Run) -> dict[str, tuple[Any, Any]]:
+        """Return the settings in which the runs differ besides their seed, with both values."""
+        ignored = {*NON_LEARNING_FIELDS, "seed"}
+        return differences(self.settings, other.settings, ignored)
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Its configuration, and what `POOLED` names."""
+        return {**self.result.config, **{name: of(self.result) for name, of in POOLED.items()}}
 
 
 @dataclass(frozen=True)
@@ -125,21 +141,10 @@ class Group:
         """Tests of the last policies by seed of the run."""
         return {run.result.seed: run.result.last for run in self.runs}
 
-    @property
-    def env_steps(self) -> int:
-        """Environment steps at the last evaluation of the longest run."""
-        return max((point.env_steps for curve in self.curves for point in curve), default=0)
-
     def area(self, end: int) -> float:
-        """Return the mean over runs of the area under success over environment steps.
-
-        Args:
-            end: last step of all runs that are compared.
-        """
+        """Return the mean over runs of the area under success over steps, until ``end``."""
         return _mean(
-            area_under_success(
-                [point.env_steps for point in curve], [point.success_rate for point in curve], end
-            )
+            area_under_success([p.env_steps for p in curve], [p.success_rate for p in curve], end)
             for curve in self.curves
         )
 
@@ -150,7 +155,7 @@ class Group:
         """
         reached = np.flatnonzero(self.curve.value >= rate)
         if not reached.size:
-            return float("nan"), float("nan")
+            return math.nan, math.nan
         steps = np.mean([curve[reached[0]].env_steps for curve in self.curves])
         return float(self.axis("updates")[reached[0]]), float(steps)
 
@@ -162,9 +167,8 @@ class Section:
     title: str
     groups: Sequence[Group]
     """In the order of tasks, then of methods."""
-    changes: Mapping[str, set[tuple[str, str]]] = field(default_factory=dict)
-    """Settings in which runs differ from the benchmark: pairs of the run's value and that of the
-    benchmark, by name."""
+    changes: Sequence[str] = ()
+    """Settings in which runs differ from the benchmark, as texts, "tau is 0.5 instead of 0.1"."""
 
     @property
     def tasks(self) -> list[str]:
@@ -176,18 +180,32 @@ class Section:
         """Methods in alphabetical order."""
         return sorted({group.method for group in self.groups})
 
+    def of_task(self, task: str) -> list[Group]:
+        """Return the groups of a task."""
+        return [group for group in self.groups if group.task == task]
+
+    def end(self, task: str) -> int:
+        """Return the environment steps at the last evaluation of all runs of a task."""
+        curves = (curve for group in self.of_task(task) for curve in group.curves)
+        return max((point.env_steps for curve in curves for point in curve), default=0)
+
+    def on_all_tasks(self) -> list[list[Group]]:
+        """Return the groups of each method that ran on every task, in the order of tasks."""
+        of_methods = ([g for g in self.groups if g.method == name] for name in self.methods)
+        return [groups for groups in of_methods if len(groups) == len(self.tasks)]
+
     @property
     def not_pooled(self) -> list[str]:
         """Rows of a task and a label that differ in what `POOLED` names, and their folders."""
-        alike: dict[tuple[str, str], list[Group]] = {}
+        found = []
         for group in self.groups:
-            alike.setdefault((group.task, group.runs[0].result.label), []).append(group)
-        return [
-            f"{row.task}, {row.method}: {', '.join(str(run.folder) for run in row.runs)}"
-            for rows in alike.values()
-            if any(_pooled(row.runs[0]) != _pooled(rows[0].runs[0]) for row in rows)
-            for row in rows
-        ]
+            first = group.runs[0]
+            others = [each.runs[0] for each in self.of_task(group.task)]
+            others = [other for other in others if other.result.label == first.result.label]
+            if any(POOLED.keys() & first.differences(other).keys() for other in others):
+                folders = ", ".join(str(run.folder) for run in group.runs)
+                found.append(f"{group.task}, {group.method}: {folders}")
+        return found
 
 
 def load_runs(
@@ -196,14 +214,7 @@ def load_runs(
     """Read every finished run below some folders, and the folders of unfinished runs.
 
     Folders with a damaged result are unfinished. Copies of a run are left out.
-
-    Raises:
-        FileNotFoundError: a folder is missing.
     """
-    roots = [Path(root) for root in roots]
-    for root in roots:
-        if not root.is_dir():
-            raise FileNotFoundError(f"there is no folder {root}")
     finished, unfinished = run_folders(roots)
     runs: list[Run] = []
     for folder in finished:
@@ -228,32 +239,29 @@ def load_sections(
     """Read every finished run below some folders.
 
     Return sections in the order of the benchmarks' names, runs without a benchmark last; and the
-    folders of unfinished runs, those with a damaged result included. Runs whose settings are not
-    those of their benchmark have a section of their own, "NAME, changed". Copies of a run are left
-    out.
+    folders of unfinished runs. Runs whose settings are not those of their benchmark have a section
+    of their own, "NAME, changed".
 
     Raises:
-        FileNotFoundError: a folder is missing, or none holds a finished run.
-        ConfigError: runs have the same settings and seed, and are no copies.
+        ConfigError: there is no finished run, or runs have the same settings and seed.
     """
     runs, unfinished = load_runs(roots, completed)
     if not runs:
-        raise FileNotFoundError(
+        raise ConfigError(
             f"no finished run below {', '.join(map(str, roots))}: "
             "a run leaves its result.json when it ends"
         )
-    by_title: dict[str, list[Run]] = {}
-    changed: dict[str, dict[str, set[tuple[str, str]]]] = {}
+    by_title: dict[str, tuple[list[Run], set[str]]] = {}
     for run in runs:
-        title, found = run.result.benchmark or OTHER_RUNS, changes(run.result)
-        title += ", changed" if found else ""
-        by_title.setdefault(title, []).append(run)
-        for name, (there, planned) in found.items():
-            of_title = changed.setdefault(title, {})
-            of_title.setdefault(name, set()).add((str(there), str(planned)))
-    titles = sorted(by_title, key=lambda title: (title == OTHER_RUNS, title))
-    sections = [Section(each, grouped(by_title[each]), changed.get(each, {})) for each in titles]
-    return sections, unfinished
+        found = changes(run.result).items()
+        title = (run.result.benchmark or OTHER_RUNS) + (", changed" if found else "")
+        of_title, texts = by_title.setdefault(title, ([], set()))
+        of_title.append(run)
+        texts |= {f"{name} is {there} instead of {planned}" for name, (there, planned) in found}
+    return [
+        Section(title, grouped(by_title[title][0]), sorted(by_title[title][1]))
+        for title in sorted(by_title, key=lambda title: (title == OTHER_RUNS, title))
+    ], unfinished
 
 
 def grouped(runs: Iterable[Run]) -> list[Group]:
@@ -264,26 +272,23 @@ def grouped(runs: Iterable[Run]) -> list[Group]:
     Raises:
         ConfigError: runs have the same settings and seed.
     """
-    named: dict[tuple[str, str], list[list[Run]]] = {}
+    alike: list[list[Run]] = []
     for run in runs:
-        alike = named.setdefault((run.result.task, run.result.label), [])
-        for group in alike:
-            if not _differences(group[0], run):
-                group.append(run)
+        names = run.result.task, run.result.label
+        for members in alike:
+            first = members[0]
+            if (first.result.task, first.result.label) == names and not first.differences(run):
+                members.append(run)
                 break
         else:
             alike.append([run])
     groups, twice = [], []
-    for (task, label), alike in named.items():
-        of_label = [
-            group[0] for (_, name), other in named.items() if name == label for group in other
-        ]
-        for members in alike:
-            seeds = [run.result.seed for run in members]
-            where = [str(run.folder) for run in members if seeds.count(run.result.seed) > 1]
-            twice += [f"{task}, {label}: {', '.join(where)}"] if where else []
-            name = label + _distinction(members[0], [other[0] for other in alike], of_label)
-            groups.append(Group(task, name, sorted(members, key=lambda run: run.result.seed)))
+    for members in alike:
+        result, seeds = members[0].result, [run.result.seed for run in members]
+        where = [str(run.folder) for run in members if seeds.count(run.result.seed) > 1]
+        twice += [f"{result.task}, {result.label}: {', '.join(where)}"] if where else []
+        method = result.label + _distinction(members[0], [other[0] for other in alike])
+        groups.append(Group(result.task, method, sorted(members, key=lambda run: run.result.seed)))
     if twice:
         raise ConfigError(
             f"runs with the same settings and seed: {'; '.join(twice)}; name the folders to report"
@@ -291,19 +296,37 @@ def grouped(runs: Iterable[Run]) -> list[Group]:
     return sorted(groups, key=lambda group: (group.task, group.method))
 
 
-def differing_settings(section: Section) -> list[tuple[str, str, str]]:
+def _distinction(run: Run, others: Sequence[Run]) -> str:
+    """Return in what a run differs from the others of its label, " (tau 0.1, protocol 1)".
+
+    Settings count on the run's task only, `_OF_METHODS` on all tasks.
+    """
+    names = set()
+    for other in others:
+        if other.result.label == run.result.label:
+            differing = run.differences(other).keys()
+            is_same_task = other.result.task == run.result.task
+            names |= differing if is_same_task else differing & {*_OF_METHODS}
+    settings = flat(run.settings)
+    values = [f"{name} {settings.get(name)}" for name in sorted(names)]
+    return f" ({', '.join(values)})" if values else ""
+
+
+def differing_settings(section: Section) -> list[dict[str, str]]:
     """Return the settings in which methods differ on a task: name, value, and its methods."""
     names = set()
     for task in section.tasks:
-        first, *others = (group.runs[0] for group in section.groups if group.task == task)
-        names |= {name for other in others for name in _differences(first, other)}
+        first, *others = (group.runs[0] for group in section.of_task(task))
+        names |= {name for other in others for name in first.differences(other)}
     found: dict[tuple[str, str], set[str]] = {}
     for group in section.groups:
-        settings = flat(_settings(group.runs[0]))
+        settings = flat(group.runs[0].settings)
         for name in names:
-            value = str(settings.get(name, "–"))
-            found.setdefault((name, value), set()).add(group.method)
-    return [(*key, ", ".join(sorted(found[key]))) for key in sorted(found)]
+            found.setdefault((name, str(settings.get(name, "–"))), set()).add(group.method)
+    return [
+        {"setting": name, "value": value, "methods": ", ".join(sorted(found[name, value]))}
+        for name, value in sorted(found)
+    ]
 
 
 def summarize(section: Section) -> list[dict[str, Any]]:
@@ -312,29 +335,40 @@ def summarize(section: Section) -> list[dict[str, Any]]:
     There is a row per task and method, and for each method that ran on every task a row in which
     the success is the mean over tasks.
     """
-    ends = {
-        task: max(group.env_steps for group in section.groups if group.task == task)
-        for task in section.tasks
-    }
-    rows = [_row(section.title, group, ends[group.task]) for group in section.groups]
-    if len(section.tasks) == 1:
-        return rows
-    for method, of_method in _on_all_tasks(section).items():
-        own = [row for row in rows if row["method"] == method]
-        success = mean_success([group.tests for group in of_method], np.random.default_rng(0))
-        rows.append(
-            {
-                **dict.fromkeys(rows[0], float("nan")),
-                "benchmark": section.title,
-                "task": ALL_TASKS,
-                "method": method,
-                "seeds": min(row["seeds"] for row in own),
-                "episodes": min(row["episodes"] for row in own),
-                **_columns("success", success),
-                **{name: _mean(row[name] for row in own) for name in ("best", "area", "hours")},
-            }
-        )
+    rows = [_row(section, group) for group in section.groups]
+    for groups in section.on_all_tasks() if len(section.tasks) > 1 else ():
+        own = [row for row in rows if row["method"] == groups[0].method]
+        success = mean_success([group.tests for group in groups], np.random.default_rng(0))
+        together = {
+            **dict.fromkeys(rows[0], math.nan),
+            "benchmark": section.title,
+            "task": ALL_TASKS,
+            "method": groups[0].method,
+            **{name: min(row[name] for row in own) for name in ("seeds", "episodes")},
+            **_columns("success", success),
+            **{name: _mean(row[name] for row in own) for name in ("best", "area", "hours")},
+        }
+        rows.append(together)
     return rows
+
+
+def _row(section: Section, group: Group) -> dict[str, Any]:
+    """Return the row of a task and a method."""
+    updates, steps = group.reaches(GOOD_RATE)
+    return {
+        "benchmark": section.title,
+        "task": group.task,
+        "method": group.method,
+        "seeds": len(group.runs),
+        "episodes": min(test.episodes for test in group.tests),
+        **_columns("success", group.success),
+        "best": _mean(run.result.best.success_rate for run in group.runs),
+        "area": group.area(section.end(group.task)),
+        "updates_to_80": updates,
+        "env_steps_to_80": steps,
+        "mean_length": _mean(test.mean_length for test in group.tests),
+        "hours": _mean(run.hours for run in group.runs),
+    }
 
 
 def compare(section: Section) -> list[dict[str, Any]]:
@@ -343,16 +377,13 @@ def compare(section: Section) -> list[dict[str, Any]]:
     There is a row per task and pair of methods, and a row of all tasks for each pair that ran on
     every task. Runs are paired by seed, test episodes by scene.
     """
-    rows = []
-    by_task = {
-        task: {group.method: group for group in section.groups if group.task == task}
+    rows = [
+        _comparison(section.title, task, [pair])
         for task in section.tasks
-    }
-    for task, groups in by_task.items():
-        for first, second in itertools.combinations(groups.values(), 2):
-            rows.append(_comparison(section.title, task, [(first, second)]))
+        for pair in itertools.combinations(section.of_task(task), 2)
+    ]
     if len(section.tasks) > 1:
-        for first, second in itertools.combinations(_on_all_tasks(section).values(), 2):
+        for first, second in itertools.combinations(section.on_all_tasks(), 2):
             pairs = list(zip(first, second, strict=True))
             rows.append(_comparison(section.title, ALL_TASKS, pairs))
     return rows
@@ -360,43 +391,36 @@ def compare(section: Section) -> list[dict[str, Any]]:
 
 def _comparison(title: str, task: str, pairs: Sequence[tuple[Group, Group]]) -> dict[str, Any]:
     """Return the row of two methods on one task, or on all tasks."""
-    nothing, seeds = Estimate(*[float("nan")] * 3), []
-    difference = improvement = nothing
-    obstacles = sorted({name for pair in pairs for name in _obstacles(*pair)})
-    if not obstacles:
+    difference = improvement = Estimate(math.nan, math.nan, math.nan)
+    least = 0
+    if obstacles := sorted({name for pair in pairs for name in _obstacles(*pair)}):
+        reading = f"not compared: {', '.join(obstacles)}"
+    else:
         tests, rates = [], []
-        for first, second in pairs:
-            shared = sorted(first.by_seed.keys() & second.by_seed.keys())
-            seeds.append(len(shared))
-            tests.append([[group.by_seed[seed] for seed in shared] for group in (first, second)])
-            rates.append([[test.success_rate for test in group.tests] for group in (first, second)])
+        for pair in pairs:
+            seeds = sorted(pair[0].by_seed.keys() & pair[1].by_seed.keys())
+            tests.append([[group.by_seed[seed] for seed in seeds] for group in pair])
+            rates.append([[test.success_rate for test in group.tests] for group in pair])
+        least = min(len(first) for first, _ in tests)
         difference = paired_difference(tests, np.random.default_rng(0))
         improvement = probability_of_improvement(rates, np.random.default_rng(0))
-    least = min(seeds, default=0)
-    first, second = pairs[0]
+        reading = DIRECTION if least < ENOUGH_SEEDS else ""
     return {
         "benchmark": title,
         "task": task,
-        "first": first.method,
-        "second": second.method,
+        "first": pairs[0][0].method,
+        "second": pairs[0][1].method,
         "seeds": least,
         **_columns("difference", difference),
         **_columns("improvement", improvement, "improvement_"),
-        "reading": f"not compared: {', '.join(obstacles)}"
-        if obstacles
-        else DIRECTION
-        if least < ENOUGH_SEEDS
-        else "",
+        "reading": reading,
     }
 
 
 def _obstacles(first: Group, second: Group) -> list[str]:
     """Return why two methods on a task are not compared."""
-    found = [
-        f"other {name}"
-        for name in ("task version", "protocol")
-        if POOLED[name](first.runs[0].result) != POOLED[name](second.runs[0].result)
-    ]
+    differing = first.runs[0].differences(second.runs[0])
+    found = [f"other {name}" for name in ("task version", "protocol") if name in differing]
     if len({tuple(test.seeds) for test in (*first.tests, *second.tests)}) > 1:
         found.append("other test episodes")
     if not first.by_seed.keys() & second.by_seed.keys():
@@ -404,36 +428,9 @@ def _obstacles(first: Group, second: Group) -> list[str]:
     return found
 
 
-def _on_all_tasks(section: Section) -> dict[str, list[Group]]:
-    """Return the groups of each method that ran on every task, in the order of tasks."""
-    found = {
-        method: [group for group in section.groups if group.method == method]
-        for method in section.methods
-    }
-    return {name: groups for name, groups in found.items() if len(groups) == len(section.tasks)}
-
-
-def _row(title: str, group: Group, end: int) -> dict[str, Any]:
-    """Return the row of a task and a method."""
-    results = [run.result for run in group.runs]
-    updates, steps = group.reaches(GOOD_RATE)
-    hours = (
-        float("nan") if result.seconds is None else result.seconds / 3600 for result in results
-    )
-    return {
-        "benchmark": title,
-        "task": group.task,
-        "method": group.method,
-        "seeds": len(results),
-        "episodes": min(test.episodes for test in group.tests),
-        **_columns("success", group.success),
-        "best": _mean(result.best.success_rate for result in results),
-        "area": group.area(end),
-        "updates_to_80": updates,
-        "env_steps_to_80": steps,
-        "mean_length": _mean(test.mean_length for test in group.tests),
-        "hours": _mean(hours),
-    }
+def pipes(header: Sequence[str], *rows: Sequence[str]) -> list[str]:
+    """Return the lines of a table in Markdown."""
+    return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]
 
 
 def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:
@@ -442,33 +439,3 @@ def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:
 
 def _mean(values: Iterable[float]) -> float:
     return float(np.mean(list(values)))
-
-
-def _pooled(run: Run) -> dict[str, Any]:
-    return {name: of(run.result) for name, of in POOLED.items()}
-
-
-def _settings(run: Run) -> dict[str, Any]:
-    return {**run.result.config, **_pooled(run)}
-
-
-def _differences(first: Run, second: Run) -> dict[str, tuple[Any, Any]]:
-    return differences(_settings(first), _settings(second), {*NON_LEARNING_FIELDS, "seed"})
-
-
-def _distinction(run: Run, alike: Sequence[Run], of_label: Sequence[Run]) -> str:
-    """Return what a run differs in from others as text, " (env.obs_size 64, protocol 1)".
-
-    Args:
-        alike: the first runs of the groups of its task and label.
-        of_label: those of its label on all tasks.
-    """
-    names = {name for other in alike for name in _differences(run, other)}
-    names |= {
-        name
-        for name in _OF_METHODS
-        if any(POOLED[name](other.result) != POOLED[name](run.result) for other in of_label)
-    }
-    settings = flat(_settings(run))
-    values = [f"{name} {settings.get(name)}" for name in sorted(names)]
-    return f" ({', '.join(values)})" if values else ""

@@ -6,12 +6,13 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
+
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.errors import MissingPackageError, install_command
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.demonstrations.demo_files import recorded_expert
 from ba_torchrl.demonstrations.episodes import Policy
-from ba_torchrl.record.plots import plot_learning_curve
 from ba_torchrl.record.results import (
     CurvePoint,
     RunResult,
@@ -62,20 +63,20 @@ def check_packages(config: ExperimentConfig) -> None:
 
 def plot_curve(config: ExperimentConfig, curve: list[CurvePoint]) -> Path:
     """Draw the learning curve with its standard error; return the file."""
-    return plot_learning_curve(
-        {
-            config.label: (
-                [point.updates for point in curve],
-                [point.success_rate for point in curve],
-                [point.success_rate - point.standard_error for point in curve],
-                [point.success_rate + point.standard_error for point in curve],
-            )
-        },
-        config.folder / "learning_curve.png",
-        title=config.task,
-        xlabel="updates",
+    from ba_torchrl.record.plots import Learning, plot_panels  # needs matplotlib
+
+    path = config.folder / "learning_curve.png"
+    updates, rates, errors = np.reshape(
+        [(point.updates, point.success_rate, point.standard_error) for point in curve], (-1, 3)
+    ).T
+    plot_panels(
+        {config.task: {config.label: Learning((updates, rates, rates - errors, rates + errors))}},
+        [path],
+        names=[config.label],
         ylabel="success rate of the greedy policy",
+        panel_in=(5, 3.6),
     )
+    return path
 
 
 def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:

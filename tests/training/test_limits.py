@@ -13,7 +13,7 @@ from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.core.files import complete_only, write_tensors, write_text
 from ba_torchrl.record.gallery import Strip, strip_figure
-from ba_torchrl.record.plots import Learning, plot_learning_curve, plot_panels
+from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.video import write_video
 from tests.training.test_resume import config_for, interrupt, run
 
@@ -63,7 +63,6 @@ def save_noise(path):
     [
         ("film.mp4", lambda path: write_video(path, noise(), fps=5)),
         ("film.gif", lambda path: write_video(path, noise(), fps=5)),
-        ("curve.png", lambda path: plot_learning_curve({"a": ((0, 1), (0, 1))}, path)),
         (
             "curve.svg",
             lambda path: plot_panels({"a": {"b": Learning(((0, 1), (0, 1)))}}, [path], names="b"),

@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.grid import jobs
@@ -22,6 +21,7 @@ from ba_torchrl.training.grid.launchers import local
 from ba_torchrl.training.grid.plan import status
 from ba_torchrl.training.persistence import RunLock
 from tests.recipes import recipe
+from tests.record.test_report import write
 from tests.training.grid.grids import COMMON, REACH, planned
 
 FAKE_WORKER = """
@@ -286,7 +286,7 @@ def test_a_damaged_result_concerns_its_run_only(tmp_path, fake):
         (runs[0].folder / "result.json").write_bytes(content)
         assert [status(run).state for run in runs] == ["failed", "done"]
         assert "delete the folder" in status(runs[0]).detail
-        page = write_report([tmp_path], tmp_path / "report")
+        page = write([tmp_path], tmp_path / "report")
         assert "result.json is damaged" in (page.parent / "table.md").read_text()
 
 
@@ -296,7 +296,7 @@ def test_a_damaged_record_of_a_failure_concerns_its_run_only(tmp_path, fake):
     for content in (b"", b'{"rea', b"\x80\x04\x95", b"[]", b"{}"):
         (runs[0].folder / "failure.json").write_bytes(content)
         assert str(status(runs[0])) == "failed: failure.json is damaged"
-        write_report([tmp_path], tmp_path / "report")
+        write([tmp_path], tmp_path / "report")
     assert fake(runs) == {}
 
 
@@ -396,6 +396,6 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
     with pytest.raises(SystemExit):
         printed("seeds=2")
     assert "the same command continues the grid\n" in capsys.readouterr().err
-    page = write_report([tmp_path / "grid"], tmp_path / "report").read_text()
+    page = write([tmp_path / "grid"], tmp_path / "report").read_text()
     assert "close_loop_4d" in page
     assert "sacfd cnn" in page
