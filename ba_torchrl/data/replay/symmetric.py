@@ -22,7 +22,8 @@ class SymmetricSampler(OneProcess, StateFolder, Sampler):
 
     Each half is drawn uniformly, with replacement, demonstrations first. While there are none of
     one kind, the whole batch is drawn from the other. A batch of odd size has one demonstration
-    more.
+    more. TorchRL's `OfflineToOnlineReplayBuffer` does not replace it: only its online part can be
+    extended, not the other by imitated successes, and it has no state from which a run resumes.
 
     Args:
         seed: of the draws; each half has a separate generator, and that of the buffer is not used.

@@ -17,7 +17,8 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
     """TorchRL's round-robin writer, which skips demonstrations when the storage is full.
 
     A new transition overwrites the oldest one whose ``is_demonstration`` flag is not set. Data
-    without this entry are written as by TorchRL's writer.
+    without this entry are written as by TorchRL's writer. Of equally ranked transitions, TorchRL's
+    `TensorDictMaxValueWriter` keeps the oldest.
     """
 
     def register_storage(self, storage: Storage) -> None:
