@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterable, Mapping
+from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote, urlsplit
 
 from pydantic import BaseModel
 from sphinx.application import Sphinx
+from sphinx.util import logging
 
 from ba_torchrl import __version__, list_robots, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
@@ -34,20 +37,66 @@ extensions = [
 myst_enable_extensions = ["dollarmath", "amsmath"]
 myst_heading_anchors = 3
 myst_fence_as_directive = ["mermaid"]
+viewcode_follow_imported_members = False  # with it, the sources link back to wrong names
 autodoc_member_order = "bysource"
 autodoc_typehints = "description"
 html_theme = "furo"
 html_title = "BA-TorchRL"
 exclude_patterns = ["_build", "results/**", "tasks.md"]
 
+logger = logging.getLogger(__name__)
 FOLDER = Path(__file__).parent
 GENERATED = FOLDER / "generated"
 """Pages of `write_pages`, which are not tracked."""
 
 
 def setup(app: Sphinx) -> None:
-    """Make the generated pages before Sphinx looks for its sources."""
+    """Make the generated pages before Sphinx looks for its sources; check what it has built."""
     app.connect("config-inited", lambda *_: write_pages())
+    app.connect("build-finished", check_site)
+
+
+class _Page(HTMLParser):
+    """The ids of a page, and the targets of links and images in its article."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__()
+        self.ids: set[str] = set()
+        self.targets: list[str] = []
+        self._is_article = False
+        self.feed(path.read_text(encoding="utf-8"))
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        found = {name: value or "" for name, value in attrs}
+        self._is_article |= tag == "article"
+        if "id" in found:
+            self.ids.add(found["id"])
+        target = found.get("href", found.get("src"))
+        if self._is_article and target is not None:
+            self.targets.append(target)
+
+    def handle_endtag(self, tag: str) -> None:
+        self._is_article &= tag != "article"
+
+
+def check_site(app: Sphinx, exception: Exception | None) -> None:
+    """Warn of each link and image of a built page whose target is missing.
+
+    Args:
+        app: whose pages are HTML.
+        exception: of the build.
+    """
+    if exception is not None or app.builder.format != "html":
+        return
+    pages = {path: _Page(path) for path in sorted(Path(app.outdir).resolve().rglob("*.html"))}
+    for path, page in pages.items():
+        for target in page.targets:
+            url = urlsplit(target)
+            there = path if not url.path else (path.parent / unquote(url.path)).resolve()
+            is_page = there in pages and bool(url.fragment or not url.path)
+            known = unquote(url.fragment) in pages[there].ids if is_page else there.exists()
+            if not url.scheme and not known:
+                logger.warning("%s: %s does not exist", path.name, target)
 
 
 def write_pages() -> None:
