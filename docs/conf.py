@@ -19,9 +19,8 @@ from sphinx.util import logging
 from ba_torchrl import __version__, list_robots, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.core.config import EnvConfig
-from ba_torchrl.envs.description import describe, expert_scores, summary
+from ba_torchrl.envs.description import describe, expert_scores, summary, tasks_by_heading
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.policy import read_card, shipped_file, shipped_policies
 

@@ -17,7 +17,7 @@ from pathlib import Path
 
 from ba_torchrl.commands.report import completed
 from ba_torchrl.core.files import write_text
-from ba_torchrl.envs.description import describe
+from ba_torchrl.envs.description import describe, tasks_by_heading
 from ba_torchrl.record.leaderboard import (
     LEGEND,
     RECORDS,
@@ -38,7 +38,6 @@ from ba_torchrl.record.summary import (
     load_runs,
     pipes,
 )
-from ba_torchrl.record.task_page import tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.protocol import PROTOCOL
 from docs.sources import ROOT

@@ -5,12 +5,19 @@ python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png overwrit
 python recipes/gallery.py 'tasks=[close_loop/block_picking]' folder=pictures overview=null
 """
 
-from pathlib import Path
+from __future__ import annotations
 
+import math
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image, ImageDraw
 from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl import list_tasks
+from ba_torchrl import list_tasks, make
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
     Count,
@@ -22,7 +29,19 @@ from ba_torchrl.cli.types import (
     Tasks,
     check_untracked,
 )
-from ba_torchrl.record.gallery import expert_strip, overview_figure, strip_figure
+from ba_torchrl.core import keys
+from ba_torchrl.core.files import replaced
+from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
+from ba_torchrl.envs.description import tasks_by_heading
+from ba_torchrl.record.video import FrameRecorder
+
+CELL, TITLE, HEADING, SPACE = 194, 36, 60, 18
+"""Width of an image, height of a title above images and of a heading above a group of tasks, and
+distance between the images of two tasks, in pixels."""
+COLUMNS = 4
+"""Tasks in a row of the picture of all tasks."""
+COLORS = 256
+"""Number of colours of a file, which halves its size."""
 
 
 class Settings(PluginSettings):
@@ -44,6 +63,15 @@ class Settings(PluginSettings):
     """Also write over files that git tracks."""
 
 
+class Strip(NamedTuple):
+    """Rendered images of an episode."""
+
+    pictures: list[np.ndarray]
+    """[H, W, 3] uint8, from the initial to the final state."""
+    first_image: np.ndarray
+    """The policy's first observation, [H, W] metres."""
+
+
 def main(settings: Settings) -> None:
     """Play one episode per task and write its pictures."""
     folder, strips = Path(settings.folder), {}
@@ -58,13 +86,89 @@ def main(settings: Settings) -> None:
         overview = [settings.overview] if settings.overview else []
         check_untracked([*files.values(), *apart.values(), *overview])
     for task, path in tqdm(files.items(), unit="task"):
-        strips[task] = expert_strip(task, settings.seed, settings.pictures)
-        tqdm.write(str(strip_figure(task, strips[task], path)))
+        strip = strips[task] = expert_strip(task, settings.seed, settings.pictures)
+        tqdm.write(str(write(labelled(task, [strip.first_image, *strip.pictures]), path)))
     for task, path in apart.items():
         strip = expert_strip(task, settings.seed, settings.pictures, deconstruct=True)
-        print(strip_figure(f"{task}, deconstruction", strip, path))
+        title = f"{task}, deconstruction"
+        print(write(labelled(title, [strip.first_image, *strip.pictures]), path))
     if settings.overview is not None:
-        print(overview_figure(strips, settings.overview))
+        print(write(overview_of(strips), Path(settings.overview)))
+
+
+def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool = False) -> Strip:
+    """Play an episode with the expert and render at most a number of images.
+
+    They are evenly spaced from the initial to the final state; those between show grasps and
+    releases if the task is open-loop. ``deconstruct`` takes the structure apart.
+    """
+    make_env = make_deconstruction_env if deconstruct else make
+    env = make_env(task, expert=True, seed=seed)
+    recorder = FrameRecorder(env)
+    try:
+        state = env.reset()
+        first = state[next(iter(env.images))][0].numpy()
+        recorder.record()
+        while not state[keys.DONE]:
+            action = state[keys.EXPERT_ACTION]
+            state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
+            recorder.record()
+    finally:
+        env.close()
+    last = len(recorder.frames) - 1
+    between = np.linspace(0, last, pictures)[1:-1].round().astype(int).tolist()
+    if recorder.contacts:
+        between = [min(recorder.contacts, key=lambda i: abs(i - wanted)) for wanted in between]
+    chosen = [*dict.fromkeys([0, *between]), last][:pictures]
+    return Strip([recorder.frames[i] for i in chosen], first)
+
+
+def labelled(title: str, images: Sequence[np.ndarray]) -> Image.Image:
+    """Return a row of images, [H, W] of any range or [H, W, 3] uint8, below a title."""
+    row = _white(len(images) * CELL, TITLE + CELL)
+    ImageDraw.Draw(row).text((2, TITLE - 2), title, "black", anchor="ls", font_size=15)
+    for column, image in enumerate(images):
+        if image.ndim == 2:
+            image = (255 * (image - image.min()) / (np.ptp(image) or 1)).astype(np.uint8)
+        picture = Image.fromarray(image).convert("RGB")
+        row.paste(picture.resize((CELL - 4, CELL - 4)), (column * CELL + 2, TITLE + 2))
+    return row
+
+
+def overview_of(strips: Mapping[str, Strip]) -> Image.Image:
+    """Return the initial and the final state of tasks, by id, under the headings of their groups.
+
+    The title of a task is its name, with its group where a heading has several.
+    """
+    groups = tasks_by_heading(strips)
+    tops = [0]
+    for tasks in groups.values():
+        tops.append(tops[-1] + HEADING + math.ceil(len(tasks) / COLUMNS) * (TITLE + CELL))
+    sheet = _white(COLUMNS * (2 * CELL + SPACE) - SPACE, tops[-1])
+    for top, (heading, tasks) in zip(tops, groups.items(), strict=False):
+        at = (2, top + HEADING - 12)
+        ImageDraw.Draw(sheet).text(at, heading, "black", anchor="ls", font_size=23)
+        has_several = len({task.split("/")[0] for task in tasks}) > 1
+        for index, task in enumerate(tasks):
+            row, column = divmod(index, COLUMNS)
+            title = (task if has_several else task.split("/")[-1]).replace("_", " ")
+            pictures = strips[task].pictures
+            pair = labelled(title.replace("/", ": "), [pictures[0], pictures[-1]])
+            left = column * (2 * CELL + SPACE)
+            sheet.paste(pair, (left, top + HEADING + row * (TITLE + CELL)))
+    return sheet
+
+
+def write(picture: Image.Image, path: Path) -> Path:
+    """Write a picture as a PNG with a palette."""
+    small = picture.quantize(COLORS, kmeans=2, dither=Image.Dither.NONE)
+    with replaced(path) as scratch:
+        small.save(scratch, format="PNG", optimize=True)
+    return path
+
+
+def _white(width: int, height: int) -> Image.Image:
+    return Image.new("RGB", (width, height), "white")
 
 
 COMMAND = Command(main, Settings, positional="tasks")

@@ -1,9 +1,10 @@
-"""Description of a task: what `ba_torchrl.describe` returns and the page of the tasks shows."""
+"""Description of a task, `ba_torchrl.describe`, and the headings under which tasks are listed."""
 
 from __future__ import annotations
 
 import inspect
 import json
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -13,6 +14,16 @@ from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 
 EXPERT_SCORES = "expert_scores.json"
 """File of `ba_torchrl.tasks`: by task and robot, what ``ba-torchrl experts`` measured."""
+
+_SIX_DOF = "Six degrees of freedom: ramps, bumps"
+_HEADINGS = {
+    "close_loop": "Close loop",
+    "open_loop": "Open loop",
+    "ramp": _SIX_DOF,
+    "bump": _SIX_DOF,
+}
+"""Heading of each group of tasks, the part of their ids before the slash. The heading of a group
+that is not listed, such as that of a plugin, is its name."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +166,15 @@ def summary(task: str) -> str:
     text = " ".join(inspect.cleandoc(TASKS[task].__doc__ or "").split())
     _, _, goal = text.partition("Goal: ")
     return f"{(goal or text).split('. ')[0].rstrip('.')}."
+
+
+def tasks_by_heading(tasks: Iterable[str]) -> dict[str, list[str]]:
+    """Return the tasks of each heading: those of the package first, then others as they occur."""
+    found: dict[str, list[str]] = {heading: [] for heading in _HEADINGS.values()}
+    for task in tasks:
+        group = task.split("/")[0]
+        found.setdefault(_HEADINGS.get(group, group), []).append(task)
+    return {heading: members for heading, members in found.items() if members}
 
 
 @cache

@@ -25,7 +25,7 @@ WORK = {
     "leaderboard": "package_runs",
     "plot": "read_config",
     "gallery": "expert_strip",
-    "tasks": "task_page",
+    "tasks": "page",
     "export": None,  # there is no run
 }
 """The first call that works, by recipe: a name in its module, or with a module of its own."""

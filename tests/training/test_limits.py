@@ -12,7 +12,6 @@ import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.core.files import complete_only, write_tensors, write_text
-from ba_torchrl.record.gallery import Strip, strip_figure
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.video import write_video
 from tests.training.test_resume import config_for, interrupt, run
@@ -66,10 +65,6 @@ def save_noise(path):
         (
             "curve.svg",
             lambda path: plot_panels({"a": {"b": Learning(((0, 1), (0, 1)))}}, [path], names="b"),
-        ),
-        (
-            "strip.png",
-            lambda path: strip_figure("a", Strip([0 * noise()[0]], noise()[0] // 128), path),
         ),
         ("page.md", lambda path: write_text(path, 10_000 * "x")),
         ("policy.safetensors", save_noise),
