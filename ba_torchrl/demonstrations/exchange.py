@@ -6,8 +6,7 @@ import functools
 import json
 import logging
 import os
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from typing import Any
 import numpy as np
 import torch
 from tensordict import NonTensorStack, TensorDict, TensorDictBase
-from torchrl.data import NonTensor, TensorSpec
 
 from ba_torchrl import __version__
 from ba_torchrl.core import keys
@@ -26,19 +24,20 @@ from ba_torchrl.demonstrations.formats.base import (
     RESULTS,
     Arrays,
     Card,
-    DemonstrationMapping,
     Entry,
     Format,
     Role,
     StoredArrays,
     check_files,
+    check_rows,
     entry_of,
     find_format,
-    plain,
+    naming_episode,
     read_card,
     read_file,
     write_file,
 )
+from ba_torchrl.demonstrations.mapping import MappedFile, entry_specs
 from ba_torchrl.envs.description import summary
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
@@ -48,10 +47,7 @@ logger = logging.getLogger(__name__)
 
 _COUNTED = {*keys.STEP_FLAGS, keys.STEP_COUNT}
 """Entries of a state that follow from the results of the steps before it."""
-_NOT_OBSERVED = {*_COUNTED, keys.EXPERT_ACTION, keys.INSTRUCTION}
 _MOST_INSTRUCTIONS = 20
-_TOLERANCE = 1e-4
-"""Part of a range by which values may exceed it, for rounding."""
 
 
 def export_demonstrations(
@@ -93,7 +89,7 @@ def export_demonstrations(
     if os.path.lexists(path):
         raise ConfigError(f"{path} exists already; choose another path")
     roles = _roles(episodes[0])
-    specs = _specs(task, env)
+    specs = entry_specs(resolve_env(task, env))
     for number, episode in enumerate(episodes):
         if missing := {*roles, *specs} - set(_roles(episode)):
             raise ConfigError(
@@ -176,10 +172,16 @@ def import_demonstrations(
             type, shape or range is not that of the environment, or rewards and successes differ.
     """
     form = _format(path)
-    if mapping is not None:
-        return _mapped(form, path, task, env, DemonstrationMapping.parse(mapping))
-    entries, episodes = _exported(form, path, task, env)
-    return _to_episodes(form, path, entries, episodes)
+    if mapping is None:
+        entries, episodes = _exported(form, path, task, env)
+    else:
+        episodes = MappedFile(form, path, resolve_env(task, env), mapping).read()
+        entries = {key: _entry(key, _role(key), values) for key, values in episodes[0].items()}
+    converted = []
+    for number, arrays in enumerate(episodes):
+        with naming_episode(path, number):
+            converted.append(_to_episode(form, entries, arrays))
+    return converted
 
 
 def count_demonstrations(
@@ -200,14 +202,7 @@ def count_demonstrations(
     form = _format(path)
     if mapping is None:
         return len(_exported(form, path, task, env)[1])
-    given = DemonstrationMapping.parse(mapping)
-    specs = _mapped_specs(path, task, env, given)
-    is_sparse = _is_sparse(task, env)
-    episodes = read_file(form, path)
-    for number, stored in enumerate(episodes):
-        with _named(path, number):
-            _fitted_entries(form, stored, given, specs, is_sparse, reads=False)
-    return len(episodes)
+    return MappedFile(form, path, resolve_env(task, env), mapping).count()
 
 
 def _format(path: Path) -> Format:
@@ -215,15 +210,6 @@ def _format(path: Path) -> Format:
     if form is None:
         raise ConfigError(f"no demonstrations at {path} in the formats {', '.join(FORMATS)}")
     return form
-
-
-@contextmanager
-def _named(path: Path, number: int) -> Iterator[None]:
-    """Begin the message of a `ConfigError` with the file and the episode."""
-    try:
-        yield
-    except ConfigError as error:
-        raise ConfigError(f"{path}, episode {number}: {error}") from None
 
 
 def _exported(
@@ -244,282 +230,17 @@ def _exported(
     return card.entries, episodes
 
 
-def _mapped(
-    form: Format, path: Path, task: str, env: dict[str, Any], mapping: DemonstrationMapping
-) -> list[TensorDict]:
-    """Return the episodes of somebody else's file, whose entries are those of the environment."""
-    specs = _mapped_specs(path, task, env, mapping)
-    is_sparse = _is_sparse(task, env)
-    episodes = []
-    for number, stored in enumerate(read_file(form, path)):
-        with _named(path, number):
-            episodes.append(_fitted_entries(form, stored, mapping, specs, is_sparse, reads=True))
-    if not episodes:
-        raise ConfigError(f"{path} holds no episodes")
-    _warn_of_constants(path, episodes, specs)
-    if keys.REWARD in mapping.entries and keys.SUCCESS not in mapping.entries:
-        if not any(arrays[keys.REWARD].any() for arrays in episodes):
-            logger.warning(
-                "%s: the rewards are all 0, and every episode counts as a success: map success, or "
-                "leave out reward, which follows from it",
-                path,
-            )
-        elif is_sparse:
-            for arrays in episodes:
-                arrays[keys.SUCCESS] = arrays[keys.REWARD]
-    steps = _steps(episodes)
-    for number, arrays in enumerate(episodes):
-        with _named(path, number):
-            episodes[number] = _with_results(_until_end(arrays), task, env)
-    if (left := _steps(episodes)) < steps:
-        logger.warning(
-            "%s: %d of %d steps are left out, those after the first success or end of an episode",
-            path,
-            steps - left,
-            steps,
-        )
-    entries = {
-        key: _entry(
-            key,
-            "result" if key in RESULTS else "action" if key == keys.ACTION else "observation",
-            values,
-        )
-        for key, values in episodes[0].items()
-    }
-    return _to_episodes(form, path, entries, episodes)
-
-
-def _mapped_specs(
-    path: Path, task: str, env: dict[str, Any], mapping: DemonstrationMapping
-) -> dict[str, TensorSpec]:
-    """Return the specifications of an environment, for whose entries there is a source."""
-    specs = _specs(task, env)
-    wanted = {*specs, *RESULTS, keys.INSTRUCTION}
-    if unknown := mapping.entries.keys() - wanted:
-        raise ConfigError(
-            f"{path}: the environment has no {', '.join(sorted(unknown))}. "
-            f"Known: {', '.join(sorted(wanted))}"
-        )
-    needed = {*specs, *({keys.INSTRUCTION} & {*env_values(task, env)["observations"]})}
-    if not _is_sparse(task, env):
-        needed |= {keys.REWARD, keys.TERMINATED}
-    if missing := needed - mapping.entries.keys():
-        raise ConfigError(f"{path}: the mapping has no {', '.join(sorted(missing))}")
-    return specs
-
-
-def _is_sparse(task: str, env: dict[str, Any]) -> bool:
-    return resolve_env(task, env).config.reward == "sparse"
-
-
-def _fitted_entries(
-    form: Format,
-    stored: StoredArrays,
-    mapping: DemonstrationMapping,
-    specs: Mapping[str, TensorSpec],
-    is_sparse: bool,
-    *,
-    reads: bool,
-) -> Arrays:
-    """Return the entries of an episode with the types and the shapes of the environment.
-
-    Args:
-        form: of the file.
-        stored: entries of the file.
-        mapping: their meaning.
-        specs: of the environment.
-        is_sparse: whether its reward is 1 on success, else 0.
-        reads: False to check shapes only; the returned arrays have no rows.
-    """
-    arrays, rows = {}, {}
-    for key, source in mapping.entries.items():
-        try:
-            found = entry_of(stored, source.source)
-            shape = found.shape
-            if not reads:
-                found = plain(np.empty((0, *shape[1:]), found.dtype))
-            values = source.values(np.asarray(found))
-            if key in specs:
-                values = _fitted(values, specs[key])
-            elif key in RESULTS:
-                values = _one_number(values)
-                if key != keys.REWARD or is_sparse:
-                    _check_zero_or_one(values)
-            elif values.dtype.kind not in "US":
-                raise ConfigError("is no text")
-            arrays[key], rows[key] = values, sum((values.shape if reads else shape)[:1])
-        except ConfigError as error:
-            raise ConfigError(f"{key}: {error}") from None
-    steps = rows[keys.ACTION]
-    for key in arrays.keys() - {keys.INSTRUCTION}:
-        name, is_result = mapping.entries[key].source, key in RESULTS
-        if is_result and rows[key] == steps + 1 and _is_before_first_step(form, name):
-            arrays[key], rows[key] = arrays[key][1:], steps
-        _check_rows(key, rows[key], steps, not is_result and key != keys.ACTION)
-    if not steps:
-        raise ConfigError("there are no actions")
-    return arrays
-
-
-def _is_before_first_step(form: Format, name: str) -> bool:
-    """Whether an entry of that name may have a row before the first step."""
-    return form.before_first_step is not None and name.startswith(form.before_first_step)
-
-
-def _warn_of_constants(
-    path: Path, episodes: Sequence[Arrays], specs: Mapping[str, TensorSpec]
-) -> None:
-    """Warn of an action or an observation that is one number in the whole file."""
-    for key, spec in specs.items():
-        first = episodes[0][key].flat[0]
-        if spec.dtype == torch.bool or key == keys.IN_HAND:  # which are often 0
-            continue
-        if all((arrays[key] == first).all() for arrays in episodes):
-            logger.warning("%s: %s is %g in all steps; is it the right entry?", path, key, first)
-
-
-def _steps(episodes: Sequence[Arrays]) -> int:
-    return sum(len(arrays[keys.ACTION]) for arrays in episodes)
-
-
 def _entry(key: str, role: Role, values: np.ndarray) -> Entry:
     """Return the entry of an episode's values, named by its key."""
     dtype = "str" if values.dtype.kind == "U" else str(values.dtype)
     return Entry(name=key, role=role, dtype=dtype, shape=values.shape[1:])
 
 
-def _specs(task: str, env: dict[str, Any]) -> dict[str, TensorSpec]:
-    """Return the specifications of an environment's observations and actions, by key."""
-    made = make(task, **env)
-    try:
-        specs = {
-            key: spec
-            for key, spec in made.observation_spec.items()
-            if key not in _NOT_OBSERVED and not isinstance(spec, NonTensor)
-        }
-        return {**specs, keys.ACTION: made.action_spec}
-    finally:
-        made.close()
-
-
-def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
-    """Return values with the type and the shape that an environment has.
-
-    Numbers become flags where they exceed 0.5; channels of images may be last; an axis of one, for
-    a channel or at the end, may be missing. Values beyond the range by no more than rounding are
-    clipped.
-    """
-    shape = tuple(spec.shape)
-    if values.ndim and (*values.shape[1:], 1) == shape:
-        values = values[..., None]
-    if values.ndim == 3 and (1, *values.shape[1:]) == shape:
-        values = values[:, None]
-    if values.shape[1:] != shape and len(shape) == 3 == values.ndim - 1:
-        values = np.moveaxis(values, -1, 1)
-    if values.shape[1:] != shape:
-        raise ConfigError(f"has the shape {list(values.shape[1:])}, needed {list(shape)}")
-    if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
-        raise ConfigError("has values that are no finite numbers")
-    if spec.dtype == torch.bool:
-        return values if values.dtype == bool else values > 0.5
-    low, high = (getattr(spec.space, name, None) for name in ("low", "high"))
-    if values.dtype.kind == "f" and not spec.dtype.is_floating_point:
-        # Zeros alone are black in either range.
-        if high is not None and (high == 255).all() and 0 < values.max(initial=0) <= 1:
-            raise ConfigError("has values from 0 to 1, needed 0 to 255; set scale: 255")
-        values = values.round()
-    if low is not None and high is not None:
-        slack = _TOLERANCE * (high - low).numpy()
-        if (values < low.numpy() - slack).any() or (values > high.numpy() + slack).any():
-            raise ConfigError(
-                f"has values from {values.min():g} to {values.max():g}, needed "
-                f"{low.min().item():g} to {high.max().item():g}; set scale and offset"
-            )
-        values = values.clip(low.numpy(), high.numpy())
-    return values.astype(torch.empty(0, dtype=spec.dtype, device="cpu").numpy().dtype, copy=False)
-
-
-def _one_number(values: np.ndarray) -> np.ndarray:
-    """Return results of the steps as [T, 1]."""
-    if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
-        raise ConfigError(
-            "has values that are no finite numbers; needed one number per step: set components, "
-            "or another source"
-        )
-    if not values.ndim or values.shape[1:] not in ((), (1,)):
-        raise ConfigError(
-            f"has the shape {list(values.shape[1:])}, needed one number per step; set components"
-        )
-    return values.reshape(-1, 1)
-
-
-def _check_zero_or_one(values: np.ndarray) -> None:
-    """Check that results are 0 or 1, but for rounding."""
-    if (np.minimum(abs(values), abs(values - 1.0)) > _TOLERANCE).any():
-        raise ConfigError(
-            f"has values from {values.min():g} to {values.max():g}, needed 0 or 1; set scale and "
-            "offset, or another source"
-        )
-
-
-def _check_rows(what: str, rows: int, steps: int, is_observed: bool) -> None:
-    """Check that there is a row for each step, of observations perhaps also one after the last."""
-    if rows - steps not in ((0, 1) if is_observed else (0,)):
-        raise ConfigError(f"{what} has {rows} rows, and there are {steps} actions")
-
-
-def _until_end(arrays: Arrays) -> Arrays:
-    """Return an episode until its first step with a success or an end."""
-    steps = len(arrays[keys.ACTION])
-    marks = [arrays[key] > 0.5 for key in RESULTS if key in arrays and key != keys.REWARD]
-    ends = np.flatnonzero(np.any(marks, axis=0)) if marks else ()
-    if not len(ends):
-        return arrays
-    steps = int(ends[0]) + 1
-    kept = {key: steps + (key not in (*RESULTS, keys.ACTION)) for key in arrays}
-    return {
-        key: values if key == keys.INSTRUCTION else values[: kept[key]]
-        for key, values in arrays.items()
-    }
-
-
-def _with_results(arrays: Arrays, task: str, env: dict[str, Any]) -> Arrays:
-    """Return an episode with the results of its steps, which its file may lack."""
-    resolved = resolve_env(task, env)
-    reward_kind = resolved.config.reward
-    steps = len(arrays[keys.ACTION])
-    is_last = np.arange(steps)[:, None] == steps - 1
-
-    def flags(key: str, default: np.ndarray) -> np.ndarray:
-        return arrays[key] > 0.5 if key in arrays else default
-
-    success = flags(keys.SUCCESS, is_last)
-    ends_at_limit = is_last & resolved.task_class.terminates_at_limit
-    terminated = flags(keys.TERMINATED, success | ends_at_limit)
-    if reward_kind == "sparse" or (reward_kind == "difference" and keys.SUCCESS in arrays):
-        terminated = terminated | success
-    ends = is_last & ~terminated  # also where the file marks no end
-    truncated = flags(keys.TRUNCATED, ends) | ends
-    reward = np.asarray(arrays.get(keys.REWARD, success), dtype=np.float32)
-    if reward_kind == "sparse" and keys.SUCCESS in arrays:
-        reward = reward.round()
-        if (reward != success).any():
-            step = int(np.flatnonzero(reward != success)[0])
-            raise ConfigError(
-                f"step {step} of {steps} has the reward {reward[step].item():g} and the success "
-                f"{int(success[step].item())}; leave out reward, which follows from success"
-            )
-    results = (reward, terminated, truncated, success)
-    out = arrays | dict(zip(RESULTS, results, strict=True))
-    if keys.INSTRUCTION in arrays:
-        texts = {*arrays[keys.INSTRUCTION].astype(str).reshape(-1).tolist()}
-        if len(texts) != 1 or not all(texts):
-            raise ConfigError(
-                f"instruction: found {sorted(texts)[:3]}, needed one sentence that remains the "
-                "same in an episode"
-            )
-        out[keys.INSTRUCTION] = np.array([*texts] * (steps + 1))
-    return out
+def _role(key: str) -> Role:
+    """Return the role of an entry of the environment."""
+    if key in RESULTS:
+        return "result"
+    return "action" if key == keys.ACTION else "observation"
 
 
 def _roles(episode: TensorDictBase) -> dict[str, Any]:
@@ -549,17 +270,6 @@ def _to_array(tensordict: TensorDictBase, key: str) -> np.ndarray:
     return values.numpy() if isinstance(values, torch.Tensor) else np.array(values.tolist())
 
 
-def _to_episodes(
-    form: Format, path: Path, entries: Mapping[str, Entry], episodes: Sequence[StoredArrays]
-) -> list[TensorDict]:
-    """Return episodes [T] as training has them, from the entries of a file."""
-    converted = []
-    for number, arrays in enumerate(episodes):
-        with _named(path, number):
-            converted.append(_to_episode(form, entries, arrays))
-    return converted
-
-
 def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays) -> TensorDict:
     steps = sum(entry_of(arrays, entries[keys.ACTION].name).shape[:1])
     if not steps:
@@ -572,7 +282,9 @@ def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays
         values = np.asarray(entry_of(arrays, entry.name))
         if entry.dtype == "str":
             text = np.resize(values.astype(str).reshape(-1), steps + 1)
-            now[key], following[key] = (_as_text(part) for part in (text[:-1], text[1:]))
+            now[key], following[key] = (
+                NonTensorStack(*map(str, part)) for part in (text[:-1], text[1:])
+            )
             continue
         if values.shape[1:] != entry.shape and entry.is_image:
             values = np.moveaxis(values, -1, 1)
@@ -583,10 +295,10 @@ def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays
                 )
             values = values[..., None]
         is_observed = entry.role == "observation"
-        if not is_observed and _is_before_first_step(form, entry.name) and len(values) > steps:
+        if not is_observed and form.has_row_before_first_step(entry.name) and len(values) > steps:
             values = values[1:] if entry.role == "result" else values[:-1]
         rows = torch.from_numpy(np.array(values, dtype=entry.dtype))
-        _check_rows(entry.name, len(values), steps, is_observed)
+        check_rows(entry.name, len(values), steps, is_observed)
         if is_observed:
             if len(rows) == steps:
                 rows = torch.cat([rows, rows[-1:]])
@@ -601,10 +313,6 @@ def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays
     for key in _COUNTED:
         now[key] = torch.cat([torch.zeros_like(following[key][:1]), following[key][:-1]])
     return TensorDict({**now, keys.NEXT: TensorDict(following, [steps])}, [steps])
-
-
-def _as_text(values: np.ndarray) -> NonTensorStack:
-    return NonTensorStack(*map(str, values))
 
 
 def env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:

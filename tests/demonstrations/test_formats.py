@@ -27,7 +27,6 @@ from ba_torchrl.core.errors import (
 )
 from ba_torchrl.demonstrations import (
     collect_demonstrations,
-    exchange,
     export_demonstrations,
     load_demonstrations,
     save_demonstrations,
@@ -36,6 +35,8 @@ from ba_torchrl.demonstrations.collect import source_config
 from ba_torchrl.demonstrations.demo_files import check_demonstrations, read_demonstrations
 from ba_torchrl.demonstrations.formats import base
 from ba_torchrl.demonstrations.formats.base import FORMATS, Format, read_card
+from ba_torchrl.demonstrations.mapping import with_results
+from ba_torchrl.envs.settings import resolve_env
 from tests.training.test_limits import limited
 
 TASK, ENV, SIZE = "close_loop/block_picking", {"obs_size": 64}, 64
@@ -440,7 +441,7 @@ def test_a_constant_entry_is_named(tmp_path, caplog):
 
 def test_an_episode_of_a_task_that_terminates_at_its_limit_is_terminated():
     arrays = {"action": np.zeros((2, 4)), "success": np.zeros((2, 1))}
-    found = exchange._with_results(arrays, "open_loop/object_grasping", {})
+    found = with_results(arrays, resolve_env("open_loop/object_grasping", {}))
     assert found["terminated"].tolist() == [[False], [True]]
     assert not found["truncated"].any()
 

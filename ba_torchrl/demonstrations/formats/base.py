@@ -6,6 +6,7 @@ import importlib
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, ClassVar, Literal
@@ -214,6 +215,10 @@ class Format(ABC):
             return (*entry.shape[1:], entry.shape[0])
         return entry.shape
 
+    def has_row_before_first_step(self, name: str) -> bool:
+        """Return whether an entry of that name may have a row before the first step."""
+        return self.before_first_step is not None and name.startswith(self.before_first_step)
+
     @abstractmethod
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
         """Write episodes, whose entries have their names in the file, to a new path."""
@@ -343,6 +348,21 @@ def read_file(form: Format, path: Path) -> list[StoredArrays]:
         raise ConfigError(f"{path} cannot be read: {_first_line(error)}") from error
 
 
+@contextmanager
+def naming_episode(path: Path, number: int) -> Iterator[None]:
+    """Begin the message of a `ConfigError` with the file and the episode."""
+    try:
+        yield
+    except ConfigError as error:
+        raise ConfigError(f"{path}, episode {number}: {error}") from None
+
+
+def check_rows(what: str, rows: int, steps: int, is_observed: bool) -> None:
+    """Check that there is a row for each step, of observations perhaps also one after the last."""
+    if rows - steps not in ((0, 1) if is_observed else (0,)):
+        raise ConfigError(f"{what} has {rows} rows, and there are {steps} actions")
+
+
 def entry_of(arrays: StoredArrays, name: str) -> np.ndarray | Rows:
     """Return an entry of a file."""
     if name not in arrays:
@@ -396,74 +416,3 @@ def card_file(path: Path) -> Path:
 def page_file(path: Path) -> Path:
     """Return the path of the card of a file or folder as a page."""
     return path / "README.md" if path.is_dir() else path.with_name(f"{path.name}.card.md")
-
-
-class Source(StrictModel):
-    """Where the values of an entry come from, in a mapping of somebody else's demonstrations."""
-
-    source: str
-    """Name in the file."""
-    components: list[int] | None = None
-    """Indices along the last axis, in their new order; None for all."""
-    scale: float | list[float] = 1.0
-    """Factor, of all components or of each."""
-    offset: float | list[float] = 0.0
-    """Added after scaling."""
-
-    @field_validator("scale", "offset", mode="before")
-    @classmethod
-    def _read_text(cls, given: Any) -> Any:
-        """Read ``1e-3``, which is text in YAML 1.1."""
-        if isinstance(given, list):
-            return [float(value) if isinstance(value, str) else value for value in given]
-        return float(given) if isinstance(given, str) else given
-
-    def values(self, found: np.ndarray) -> np.ndarray:
-        """Return the values of an entry of an episode, from those in the file."""
-        try:
-            if self.components is not None:
-                if found.ndim < 2:
-                    raise IndexError("has one number per step, no components")
-                found = found[..., self.components]
-            if self.scale == 1.0 and self.offset == 0.0:
-                return found
-            return found * np.asarray(self.scale) + np.asarray(self.offset)
-        except (IndexError, ValueError, TypeError) as error:
-            raise ConfigError(f"{self.source}, {found.shape}: {error}") from None
-
-
-class DemonstrationMapping(StrictModel):
-    """By key of the TensorDict, the name in the file, or a `Source`."""
-
-    entries: dict[str, Source] = Field(min_length=1)
-
-    @classmethod
-    def parse(cls, mapping: str | Path | Mapping[str, Any]) -> DemonstrationMapping:
-        """Return a mapping that is given as a YAML file or as its values."""
-        what: Any = "mapping"
-        if not isinstance(mapping, Mapping):
-            what, mapping = mapping, _read_yaml(Path(mapping))
-        if not isinstance(mapping, Mapping):
-            raise ConfigError(f"{what}: must map keys to names in the file, got {mapping!r}")
-        given = {
-            str(key): {"source": value} if isinstance(value, str) else value
-            for key, value in mapping.items()
-        }
-        try:
-            return cls.model_validate({"entries": given})
-        except ValidationError as error:
-            first = error.errors()[0]
-            where = ".".join(map(str, first["loc"][1:]))
-            raise ConfigError(f"{what}: {where}: {first['msg']}") from None
-
-
-def _read_yaml(path: Path) -> Any:
-    try:
-        import yaml
-    except ImportError as error:
-        fix = f"mappings need a package that is not installed: {install_command('omegaconf')}"
-        raise MissingPackageError(fix) from error
-    try:
-        return yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, yaml.YAMLError) as error:
-        raise ConfigError(f"{path}: {' '.join(str(error).split())}") from None
