@@ -13,7 +13,6 @@ import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from types import ModuleType
 
 from ba_torchrl import __version__
 from ba_torchrl.core.errors import install_command, known_names
@@ -72,7 +71,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
         if os.getcwd() not in sys.path:  # where `plugins` are, as with `python -m`
             sys.path.insert(0, os.getcwd())
-        _import(first).COMMAND.run(rest)
+        try:
+            importlib.import_module(f"ba_torchrl.commands.{first}").COMMAND.run(rest)
+        except ModuleNotFoundError as error:
+            end = _missing(first, error)
+            if end is None:
+                raise
+            sys.stderr.write(f"error: {end}\n")
+            sys.exit(EXIT_CODE)
     else:
         end = known_names(first, command_names())
         sys.stderr.write(f"error: unknown command {first!r}.{end}\n")
@@ -86,20 +92,16 @@ def config_dir() -> Path:
     return installed if installed.is_dir() else package.parent / "configs"
 
 
-def _import(command: str) -> ModuleType:
-    """Return the module of a command; end the process if a package is missing."""
-    try:
-        return importlib.import_module(f"ba_torchrl.commands.{command}")
-    except ModuleNotFoundError as error:
-        name = (error.name or "").split(".")[0]
-        package = {"hydra": "hydra-core", "PIL": "pillow"}.get(name, name)
-        if package in ("", "ba_torchrl"):
-            raise
-        is_extra = package in OF_TRAINING
-        what = "the extra [train] of the package, of which" if is_extra else "a package:"
-        fix = install_command(*(OF_TRAINING if is_extra else [package]))
-        sys.stderr.write(f"error: {PROGRAM} {command} needs {what} {package!r} is missing: {fix}\n")
-        sys.exit(EXIT_CODE)
+def _missing(command: str, error: ModuleNotFoundError) -> str | None:
+    """Return the message on a package that a command needs, None if the module is one of ours."""
+    name = (error.name or "").split(".")[0]
+    package = {"hydra": "hydra-core", "PIL": "pillow"}.get(name, name.replace("_", "-"))
+    if package in ("", "ba-torchrl"):
+        return None
+    is_extra = package in OF_TRAINING
+    what = "the extra [train] of the package, of which" if is_extra else "a package:"
+    fix = install_command(*(OF_TRAINING if is_extra else [package]))
+    return f"{PROGRAM} {command} needs {what} {package!r} is missing: {fix}"
 
 
 def overview() -> str:

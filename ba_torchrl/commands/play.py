@@ -26,7 +26,7 @@ from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import complete_only
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
-from ba_torchrl.record.video import MAX_FPS, MIN_FPS, write_video
+from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
     from ba_torchrl.demonstrations.episodes import Policy
@@ -49,7 +49,7 @@ class Settings(EnvSettings):
     """Keyboard: leave out failed episodes."""
     video: VideoFile | None = "play.mp4"
     """A file such as play.mp4 or play.gif, or null; of the keyboard there is none."""
-    fps: Annotated[float, Field(ge=MIN_FPS, le=MAX_FPS)] | None = None
+    fps: Annotated[float, Field(ge=1, le=240)] | None = None
     """Frames a second, or steps a second while a key is down; null for 5 in close loop and 10 in
     open loop, where frames between the poses of a step show the arm move, by interpolation."""
 

@@ -3,30 +3,23 @@
 from __future__ import annotations
 
 import csv
-import importlib.util
 import logging
 import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from ba_torchrl.core.errors import MissingPackageError, install_command
 from ba_torchrl.record.results import flat
 
-if TYPE_CHECKING:
-    from torchrl.record.loggers import Logger
-
 Backend = Literal["csv", "tensorboard", "wandb"]
+"""The file alone, or also one of TorchRL's loggers."""
 
 SCALARS_FILE = "scalars.csv"
 FILE_INTERVAL_S = 10.0
-LAST_BYTES = 1000
-"""Bytes at the end of the file that hold its last row."""
-_COLUMNS = ("step", "name", "value")
 
 
 class Series(NamedTuple):
@@ -36,41 +29,6 @@ class Series(NamedTuple):
     """[n] int64, ascending."""
     values: np.ndarray
     """[n] float64."""
-
-
-def make_logger(
-    backend: Backend, run_dir: str | Path, name: str, config: Mapping[str, Any]
-) -> Logger | None:
-    """Return TorchRL's logger for ``backend``; None for "csv", which `ScalarLog` writes.
-
-    The configuration of the run, which may be nested, is logged as hyper-parameters.
-
-    Raises:
-        ValueError: the backend is unknown.
-        ImportError: its package is missing; the message says how to install it.
-    """
-    if backend == "csv":
-        return None
-    if backend not in ("tensorboard", "wandb"):
-        raise ValueError(f"unknown logger {backend!r}; known are csv, tensorboard and wandb")
-    if not is_available(backend):
-        raise MissingPackageError(
-            f"the logger {backend!r} needs a package that is not installed: "
-            + install_command(backend)
-        )
-    from torchrl.record.loggers import get_logger
-
-    options = {"wandb_kwargs": {"project": "ba-torchrl"}} if backend == "wandb" else {}
-    logger = get_logger(backend, logger_name=str(run_dir), experiment_name=name, **options)
-    known = (int, float, str)  # types that every backend supports
-    settings = {k: v if isinstance(v, known) else str(v) for k, v in flat(config).items()}
-    logger.log_hparams(settings)
-    return logger
-
-
-def is_available(backend: Backend) -> bool:
-    """Return whether the package of a backend is installed."""
-    return backend == "csv" or importlib.util.find_spec(backend) is not None
 
 
 def limit_library_logs() -> None:
@@ -89,10 +47,8 @@ class ScalarLog:
 
     The file has the columns step, name and value, one row per scalar, and is complete after each
     `write`. A resumed run appends to the same file. TorchRL's CSV logger is not used, because it
-    writes one file without a header per scalar and keeps all values in memory.
-
-    Raises:
-        ImportError: the package of the backend is missing.
+    writes one file without a header per scalar and keeps all values in memory. The configuration of
+    the run, which may be nested, is logged as hyper-parameters.
     """
 
     def __init__(
@@ -101,12 +57,22 @@ class ScalarLog:
         run_dir = Path(run_dir)
         run_dir.mkdir(parents=True, exist_ok=True)
         self.path = run_dir / SCALARS_FILE
-        self.logger = make_logger(backend, run_dir, run_dir.name, config or {})
+        self.logger = None
+        if backend != "csv":
+            from torchrl.record.loggers import get_logger
+
+            options = {"wandb_kwargs": {"project": "ba-torchrl"}} if backend == "wandb" else {}
+            self.logger = get_logger(
+                backend, logger_name=str(run_dir), experiment_name=run_dir.name, **options
+            )
+            known = (int, float, str)  # types that every backend supports
+            settings = flat(config or {}).items()
+            self.logger.log_hparams({k: v if isinstance(v, known) else str(v) for k, v in settings})
         _drop_incomplete_row(self.path)
         self._file = self.path.open("a", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file, lineterminator="\n")
         if self._file.tell() == 0:
-            self._writer.writerow(_COLUMNS)
+            self._writer.writerow(("step", "name", "value"))
 
     def write(self, step: int, scalars: Mapping[str, float]) -> None:
         """Write scalars, numbers or tensors of one element, after ``step`` gradient updates."""
@@ -140,8 +106,7 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
         path /= SCALARS_FILE
     text = path.read_text(encoding="utf-8", errors="replace")
     rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
-    if tuple(next(rows, ())) != _COLUMNS:
-        raise ValueError(f"{path} does not start with the columns {', '.join(_COLUMNS)}")
+    next(rows, None)
     found: dict[str, dict[int, float]] = {}
     for number, row in enumerate(rows, start=2):
         try:
@@ -156,14 +121,9 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
 
 
 def last_step(run_dir: str | Path) -> int | None:
-    """Return the step of the last row in a run's scalars, without reading those before it; None if
-    there is none yet."""
+    """Return the step of the last row in a run's scalars; None if there is none yet."""
     path = Path(run_dir) / SCALARS_FILE
-    if not path.exists():
-        return None
-    with path.open("rb") as file:
-        file.seek(max(0, path.stat().st_size - LAST_BYTES))
-        rows = file.read().split(b"\n")
+    rows = path.read_bytes().split(b"\n") if path.exists() else []
     step = rows[-2].split(b",")[0] if len(rows) > 1 else b""
     return int(step) if step.isdigit() else None
 

@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import cached_property
+from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
@@ -17,7 +18,7 @@ from ba_torchrl.core.config import MAX_SEED, CompileMode, Source, WorkerOptions,
 from ba_torchrl.core.errors import ConfigError, install_command
 from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
-from ba_torchrl.record.logging import is_available
+from ba_torchrl.record.logging import Backend
 from ba_torchrl.tasks.structures.base import check_has_structure
 
 if TYPE_CHECKING:
@@ -124,7 +125,7 @@ class ExperimentConfig(WorkerOptions):
     """Minutes after which the state for ``resume`` is saved, besides at every evaluation."""
     log_every: int = Field(default=50, ge=1)
     """Updates between rows of the losses; a shorter run has one row, that of its last update."""
-    logger: Literal["csv", "tensorboard", "wandb"] = "csv"
+    logger: Backend = "csv"
     """Logger of scalars in addition to the run folder's CSV file."""
     video_episodes: int = Field(default=3, ge=0)
     """Greedy episodes in the video at the end."""
@@ -251,7 +252,7 @@ class ExperimentConfig(WorkerOptions):
             name = config.algorithm["name"]
             raise ConfigError(f"compile_mode: algorithm {name!r} cannot be compiled; leave it out")
         config._check_demonstrations()
-        if not is_available(config.logger):
+        if config.logger != "csv" and find_spec(config.logger) is None:
             raise ConfigError(
                 f"logger: {config.logger!r} needs a package that is not installed: "
                 + install_command(config.logger)

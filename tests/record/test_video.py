@@ -1,5 +1,3 @@
-import sys
-
 import numpy as np
 import pytest
 
@@ -54,32 +52,3 @@ def test_a_gif_keeps_the_colour_of_an_object_in_a_single_frame(tmp_path):
     video[7][10:30, 10:30] = (220, 90, 20)
     read = imageio.imread(write_video(tmp_path / "episode.gif", video, fps=4), index=7)
     assert np.abs(read[12:28, 12:28, :3].astype(int) - (220, 90, 20)).max() < 20
-
-
-@pytest.mark.parametrize(
-    ("frames", "message"),
-    [
-        ([], "at least one frame"),
-        (np.zeros((3, 8, 8, 3)), r"frame 0 is \[8, 8, 3\] float64"),
-        (np.zeros((3, 8, 8, 1), np.uint8), r"frame 0 is \[8, 8, 1\]"),
-        ([np.zeros((8, 8, 3), np.uint8), np.zeros((8, 6, 3), np.uint8)], "frame 1"),
-    ],
-)
-def test_refuses_other_frames(tmp_path, frames, message):
-    with pytest.raises(ValueError, match=message):
-        write_video(tmp_path / "episode.mp4", frames, fps=5)
-    assert not list(tmp_path.iterdir())
-
-
-def test_refuses_other_suffixes_and_speeds(tmp_path):
-    with pytest.raises(ValueError, match=r"mp4 or \.gif"):
-        write_video(tmp_path / "episode.avi", record_episodes(2, 32, 32), fps=5)
-    with pytest.raises(ValueError, match="fps must be a number from 1 to 240"):
-        write_video(tmp_path / "episode.mp4", record_episodes(2, 32, 32), fps=0)
-
-
-@pytest.mark.parametrize("package", ["imageio", "imageio_ffmpeg"])
-def test_a_missing_package_is_an_error_with_the_fix(tmp_path, monkeypatch, package):
-    monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(ImportError, match=r"pip install .*imageio"):
-        write_video(tmp_path / "episode.mp4", record_episodes(2, 32, 32), fps=5)
