@@ -7,6 +7,7 @@ from torchrl.data.replay_buffers.samplers import SamplerWithoutReplacement
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.base import ActorCriticSpec
 from ba_torchrl.modules.spatial.base import SpatialSpec
+from ba_torchrl.sim.robots.base import ROBOTS
 
 
 def slow_except(values, fast):
@@ -14,6 +15,11 @@ def slow_except(values, fast):
     return [
         value if value in fast else pytest.param(value, marks=pytest.mark.slow) for value in values
     ]
+
+
+def slow_except_two_robots():
+    """Return the names of the robots; of those with other grippers, two are for slow tests."""
+    return slow_except(list(ROBOTS), ["kuka", "ur5_robotiq"])
 
 
 def from_replay(transform, data):

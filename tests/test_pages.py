@@ -19,11 +19,11 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 DEMONSTRATIONS = "demos/pulling"
 SHORTER = {
-    "agent.learn(10_000)": "agent.learn(120)",
+    "agent.learn(10_000)": "agent.learn(102)",
     "n_eval_episodes=20": "n_eval_episodes=1",
     "episodes=500)": "episodes=2)",
     "buffer_size=10_000": "buffer_size=200",
-    '"close_loop/block_picking", 5,': '"close_loop/block_picking", 2,',
+    '"close_loop/block_picking", 5,': '"close_loop/block_picking", 1,',
     '"mine/tall_block", 4)': '"mine/tall_block", 1)',
 }
 """Parts of the pages' Python that take minutes or many processes, and what runs instead."""

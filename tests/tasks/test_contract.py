@@ -148,18 +148,25 @@ def test_an_episode_of_every_robot_starts_valid_and_unsolved(task, robot):
 
 
 def test_the_expert_succeeds(task):
-    check_expert(task, episodes=10, margin=0.1)
+    check_expert(task, episodes=4, margin=0.25)
 
 
+@pytest.mark.parametrize(
+    "task",
+    [
+        "close_loop/block_stacking",
+        "close_loop/corner_picking",
+        "open_loop/covid_test",
+        "open_loop/object_grasping",
+    ],
+)
 def test_the_expert_succeeds_without_yaw(task):
-    if task in NOT_WITHOUT_YAW:
-        pytest.skip(NOT_WITHOUT_YAW[task])
     check_expert(task, episodes=5, margin=0.2, **without_yaw(task))
 
 
 @pytest.mark.parametrize("task", LOW)
 def test_the_expert_succeeds_with_heights_and_all_angles(task):
-    check_expert(task, episodes=10, margin=0.1, action_sequence="pxyzrrr")
+    check_expert(task, episodes=5, margin=0.2, action_sequence="pxyzrrr")
 
 
 @pytest.mark.slow
@@ -225,7 +232,7 @@ def test_the_expert_recovers_from_random_actions_over_60_episodes(task):
 
 
 def test_the_expert_repeats_no_action_in_an_unchanged_scene(task):
-    check_progress(task, episodes=2 if task in LONG_EPISODES else 4)
+    check_progress(task, episodes=1 if task in LONG_EPISODES else 2)
 
 
 def test_the_expert_repeats_no_action_with_small_blocks():

@@ -14,7 +14,7 @@ from ba_torchrl.tasks.manipulation.footprints import outline
 from ba_torchrl.tasks.manipulation.primitives import grasped_body
 from ba_torchrl.testing.episodes import expert_policy
 from ba_torchrl.testing.progress import close_around_object
-from tests.tasks.episodes import play
+from tests.tasks.episodes import play, slow
 
 
 def idle(env, state):
@@ -82,7 +82,7 @@ def test_a_hand_whose_fingertips_press_on_the_floor_moves_up(make_env):
     assert env.scene.robot.tool_pose()[0][2] > height_m + 0.03
 
 
-@pytest.mark.parametrize("task", ["house_building_4", "improvise_house_building_2"])
+@pytest.mark.parametrize("task", ["house_building_4", *slow(["improvise_house_building_2"])])
 def test_a_piece_flush_with_the_roof_is_picked(make_env, task):
     env = make_env(f"open_loop/{task}", obs_size=128, max_steps=30)
     solved = 0
@@ -140,19 +140,19 @@ def test_a_tool_that_moves_away_from_the_block_keeps_its_height(make_env, task):
 
 def test_a_pull_keeps_the_outlines_of_the_blocks_in_the_workspace(make_env):
     env = make_env("close_loop/block_pulling", workspace_check="bounding_box", obs_size=16)
-    assert all(play(env, env.reset())["success"] for _ in range(12))
+    assert all(play(env, env.reset())["success"] for _ in range(6))
 
 
 @pytest.mark.parametrize(
     ("task", "error"),
     [
-        ("close_loop/object_grasping", 0.2),
-        ("close_loop/house_building", 0.2),
         ("close_loop/corner_picking", 0.2),
-        ("close_loop/drawer_opening", 0.2),
-        ("open_loop/bottle_arrangement", 0.018),
         ("open_loop/covid_test", 0.018),
-        ("open_loop/object_grasping", 0.018),
+        pytest.param("close_loop/object_grasping", 0.2, marks=pytest.mark.slow),
+        pytest.param("close_loop/house_building", 0.2, marks=pytest.mark.slow),
+        pytest.param("close_loop/drawer_opening", 0.2, marks=pytest.mark.slow),
+        pytest.param("open_loop/bottle_arrangement", 0.018, marks=pytest.mark.slow),
+        pytest.param("open_loop/object_grasping", 0.018, marks=pytest.mark.slow),
     ],
 )
 def test_a_policy_with_errors_succeeds(make_env, task, error):

@@ -9,6 +9,7 @@ import pytest
 from ba_torchrl.demonstrations.collect import expert_scores
 from ba_torchrl.sim.robots import ur5
 from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
+from tests.tasks.episodes import slow
 
 MODELS = Path(ur5.__file__).parent / "models"
 WIDTH_M, WIDER_M = "0.019", "0.0285"
@@ -46,9 +47,8 @@ def test_only_the_width_of_the_fingers_differs(robot):
     "task",
     [
         "open_loop/block_stacking",
-        "open_loop/bin_packing",
         "close_loop/block_stacking",
-        "close_loop/drawer_opening",
+        *slow(["open_loop/bin_packing", "close_loop/drawer_opening"]),
     ],
 )
 def test_experts_succeed_with_wide_fingers(robot, task):

@@ -6,10 +6,11 @@ import pytest
 import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.tasks.base import TASKS, check_scales
-from tests.tasks.episodes import slow_variants
+from tests.specs import slow_except
 
 FIXED = {"action_sequence": "pxyz", "random_orientation": False}
 BEYOND = 0.02
+FAST = ("close_loop/block_in_bowl", "open_loop/house_building_3", "bump/box_palletizing")
 SCALED = [task for task in ba_torchrl.list_tasks() if np.ptp(TASKS[task].scale_limits) > 0]
 
 
@@ -25,7 +26,7 @@ def steps_to_success(task, episodes, **config):
     return steps
 
 
-@pytest.mark.parametrize("config", [{}, FIXED], ids=["free", "fixed"])
+@pytest.mark.parametrize("config", [{}, pytest.param(FIXED, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("task", "mean_steps"), [("close_loop/block_pushing", 9), ("close_loop/corner_picking", 18)]
 )
@@ -37,7 +38,7 @@ def test_experts_push_and_drag_small_blocks(task, mean_steps, config):
 
 
 @pytest.mark.parametrize("end", [0, 1], ids=["smallest", "largest"])
-@pytest.mark.parametrize("task", slow_variants(SCALED))
+@pytest.mark.parametrize("task", slow_except(SCALED, FAST))
 def test_experts_solve_tasks_at_both_limits(task, end):
     scale = TASKS[task].scale_limits[end]
     assert None not in steps_to_success(task, 2, object_scale_range=scale)

@@ -14,11 +14,11 @@ SMALL = {"batch_size": 4, "buffer_size": 100}
     ("preset", "network", "obs_size"),
     [
         ("rad_sac", "cnn", 64),
-        ("rad_sacfd", "cnn", 64),
-        ("drq_sac", "cnn", 64),
         ("drq_sacfd_per", "cnn", 64),
         ("ferm_sacfd", "ferm", 142),
-        ("ferm_sacfd_per", "ferm", 142),
+        pytest.param("rad_sacfd", "cnn", 64, marks=pytest.mark.slow),
+        pytest.param("drq_sac", "cnn", 64, marks=pytest.mark.slow),
+        pytest.param("ferm_sacfd_per", "ferm", 142, marks=pytest.mark.slow),
     ],
 )
 def test_a_run_collects_learns_and_evaluates(tmp_path, preset, network, obs_size):

@@ -11,6 +11,7 @@ from ba_torchrl.sim.geometry import Pose
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import FINE_PHYSICS, World
+from tests.specs import slow_except_two_robots
 
 SIZE_M = 0.04
 HEIGHT_M = 0.2
@@ -64,7 +65,7 @@ class Scene:
         return pose_in_tool_frame(self.robot, self.cube)
 
 
-@pytest.mark.parametrize("robot", list(ROBOTS))
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 def test_a_body_that_does_not_slip_keeps_its_pose_in_the_tool_frame(robot):
     with Scene(robot) as scene:
         assert scene.lift() > 10

@@ -5,8 +5,8 @@ import math
 import pybullet
 import pytest
 
-from ba_torchrl.sim.robots.base import ROBOTS
 from tests.sim.control.ramp_scene import RampScene
+from tests.specs import slow_except_two_robots
 
 HORIZONTAL = (0.0, 0.0, math.pi / 2)
 
@@ -21,7 +21,7 @@ def lowest_link_m(robot):
     return min(distances, default=0.5)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 @pytest.mark.parametrize("teleport", [True, False])
 def test_a_horizontal_tool_near_the_floor_is_out_of_reach(robot, teleport):
     scene = RampScene(robot=robot, teleport=teleport)

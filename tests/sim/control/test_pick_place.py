@@ -13,6 +13,7 @@ from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
+from tests.specs import slow_except_two_robots
 
 B = 0.03
 HOME_Z_M = 0.3
@@ -143,7 +144,7 @@ def test_a_pick_at_an_empty_position_changes_nothing(table):
     np.testing.assert_allclose(t.robot.joints, t.robot.home_joints)
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 @pytest.mark.parametrize("teleport", [True, False])
 def test_a_pick_near_the_floor_succeeds(table, robot, teleport):
     """Fingers that move down as they close stay clear of the floor."""
@@ -157,7 +158,7 @@ def test_a_pick_near_the_floor_succeeds(table, robot, teleport):
         assert block.position[2] > HOME_Z_M
 
 
-@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 @pytest.mark.parametrize("turn", [(0.0, 0.0, 0.0), (0.4, 0.0, 0.3), (0.4, -0.3, 0.2)])
 def test_lowest_tool_is_tight_for_closing_fingers(table, robot, turn):
     """At the lowest height of the tool, the clearance of the closing fingers is 1 mm."""

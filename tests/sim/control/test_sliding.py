@@ -16,6 +16,7 @@ from ba_torchrl.sim.control.close_loop import CloseLoopController, Path
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
+from tests.specs import slow_except_two_robots
 
 
 class Scene:
@@ -49,7 +50,7 @@ class Scene:
 
 
 @pytest.mark.parametrize("opening", [0.0, 1.0])
-@pytest.mark.parametrize("robot", list(ROBOTS))
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 def test_fingers_that_press_on_the_floor_slide_along_it(robot, opening):
     with Scene(robot, opening) as scene:
         for _ in range(2):
@@ -61,7 +62,7 @@ def test_fingers_that_press_on_the_floor_slide_along_it(robot, opening):
             assert scene.forces()[0] < 2 * scene.controller.limits.max_vertical_force_n
 
 
-@pytest.mark.parametrize("robot", list(ROBOTS))
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 def test_a_wall_stops_fingers_that_slide_along_the_floor(robot):
     with Scene(robot, 0.0, Box(size_m=(0.3, 0.02, 0.1), mass_kg=0.0)) as scene:
         scene.bodies[0].place((0.45, 0.0, 0.05), 0.0)

@@ -10,13 +10,14 @@ from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS, measured_gripper
 from ba_torchrl.sim.robots.gripper import GRASP_HEIGHT_M, Gripper
 from ba_torchrl.sim.world import World
+from tests.specs import slow_except_two_robots
 
 POSITION = (0.45, 0.0, 0.25)
 RAY_M = 3e-3
 """Largest lateral error of the measurement: the ray spacing plus the collision margins."""
 
 
-@pytest.fixture(params=list(ROBOTS))
+@pytest.fixture(params=slow_except_two_robots())
 def name(request):
     return request.param
 

@@ -13,6 +13,7 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
+from tests.specs import slow_except_two_robots
 
 CLOSE_LOOP = ((0.3, -0.15, 0.01), (0.6, 0.15, 0.25))
 OPEN_LOOP = ((0.25, -0.2, 0.0), (0.65, 0.2, 0.4))
@@ -56,7 +57,7 @@ class Scene:
         return np.array(pybullet.multiplyTransforms(*to_tool, *body.pose)[0])
 
 
-@pytest.fixture(scope="module", params=list(ROBOTS))
+@pytest.fixture(scope="module", params=slow_except_two_robots())
 def shared(request):
     scene = Scene(request.param)
     with scene.world:
@@ -418,7 +419,7 @@ def trajectory(world, robot, blocks, motion):
     return trace
 
 
-@pytest.mark.parametrize("name", list(ROBOTS))
+@pytest.mark.parametrize("name", slow_except_two_robots())
 def test_random_actions_keep_blocks_in_place_and_repeat_bit_by_bit(name):
     traces = []
     with World() as first, World() as second:
@@ -444,7 +445,7 @@ EXPERTS = [
 
 
 @pytest.mark.parametrize(("task", "variant"), EXPERTS)
-@pytest.mark.parametrize("robot", list(ROBOTS))
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 def test_experts_succeed_with_every_robot(robot, task, variant):
     env = ba_torchrl.make(
         f"close_loop/block_{task}", robot=robot, expert=True, seed=0, obs_size=16, **variant

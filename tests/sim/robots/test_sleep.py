@@ -7,6 +7,7 @@ import ba_torchrl
 from ba_torchrl.sim.robots.base import ROBOTS, RobotSleep
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
+from tests.specs import slow_except_two_robots
 
 CUBE = Box(size_m=(0.05, 0.05, 0.05))
 
@@ -44,7 +45,7 @@ def drop(bodies, position=(0.5, 0.0, 0.08)):
         body.place((x + 0.012 * i, y + 0.008 * i, z + 0.055 * i), 0.3 * i)
 
 
-@pytest.mark.parametrize("robot_name", list(ROBOTS))
+@pytest.mark.parametrize("robot_name", slow_except_two_robots())
 def test_bodies_settle_in_the_same_way_beside_a_sleeping_robot(robot_name):
     results = []
     for sleeps in (False, True):
