@@ -3,10 +3,12 @@
 Each is forked from one server: it starts in milliseconds, `python script.py` in seconds.
 """
 
+import atexit
 import multiprocessing
 import os
 import runpy
 import sys
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from subprocess import CompletedProcess
 
@@ -28,16 +30,22 @@ def run_script(
         paths: further folders of modules.
         check: whether another exit code than 0 fails the test.
     """
-    script = folder / "script.py"
-    script.write_text(code)
-    process = CONTEXT.Process(target=_main, args=(script, (folder, *paths)))
-    process.start()
+    process = start_script(folder, code, paths)
     process.join(TIMEOUT_S)
     if process.exitcode is None:
         process.kill()
     out, error = ((folder / name).read_text() for name in ("stdout", "stderr"))
     assert process.exitcode == 0 or not check, error[-3000:]
-    return CompletedProcess([str(script)], process.exitcode, out, error)
+    return CompletedProcess(["script.py"], process.exitcode, out, error)
+
+
+def start_script(folder: Path, code: str, paths: tuple[Path, ...] = ()) -> BaseProcess:
+    """Start code in a folder as `run_script` does; return its process."""
+    script = folder / "script.py"
+    script.write_text(code)
+    process = CONTEXT.Process(target=_main, args=(script, (folder, *paths)))
+    process.start()
+    return process
 
 
 def _main(script: Path, paths: tuple[Path, ...]) -> None:
@@ -47,4 +55,7 @@ def _main(script: Path, paths: tuple[Path, ...]) -> None:
     os.environ["OMP_NUM_THREADS"] = "1"
     sys.path[:0] = map(str, paths)
     sys.argv = [str(script)]
-    runpy.run_path(str(script), run_name="__main__")
+    try:
+        runpy.run_path(str(script), run_name="__main__")
+    finally:
+        atexit._run_exitfuncs()

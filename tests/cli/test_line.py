@@ -69,7 +69,7 @@ def test_help_and_mistakes_are_answered_without_torch():
     assert done.returncode == 0, done.stderr[-2000:]
 
 
-@pytest.mark.parametrize("words", [["--help"], ["doctor"], ["train", "--help"], ["tasks"]])
+@pytest.mark.parametrize("words", [["train", "--help"], ["tasks"]])
 def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
     code = (
         "import os\nreader, writer = os.pipe()\nos.close(reader)\nos.dup2(writer, 1)\n"

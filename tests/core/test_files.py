@@ -6,8 +6,6 @@ import fcntl
 import json
 import os
 import signal
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -28,6 +26,7 @@ from ba_torchrl.core.files import (
     write_state,
     write_text,
 )
+from tests.fresh import run_script
 
 weights = torch.arange(6.0).reshape(2, 3)
 STATE = {
@@ -241,25 +240,24 @@ def test_a_second_writer_is_refused(tmp_path):
 
 
 _WRITER = """
-import os, signal, sys
+import os, signal
 from pathlib import Path
 from ba_torchrl.core.files import complete_only
 
-with complete_only(Path(sys.argv[1])) as scratch:
+with complete_only(Path("demos")) as scratch:
     scratch.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def test_a_writer_that_was_killed_blocks_nobody(tmp_path):
-    path = tmp_path / "demos"
-    killed = subprocess.run([sys.executable, "-c", _WRITER, str(path)], check=False)
+    killed = run_script(tmp_path, _WRITER, check=False)
     assert killed.returncode == -signal.SIGKILL
     assert (tmp_path / ".demos.scratch/demos").exists()
-    with complete_only(path) as scratch:
+    with complete_only(tmp_path / "demos") as scratch:
         assert not scratch.exists()
         scratch.write_text("whole")
-    assert list(tmp_path.iterdir()) == [path]
+    assert {path.name for path in tmp_path.iterdir()} == {"demos", "script.py", "stdout", "stderr"}
 
 
 def test_a_lock_that_cannot_name_its_process_is_deleted(tmp_path, monkeypatch):

@@ -157,7 +157,7 @@ def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel():
     rollouts = []
     for parallel in (True, False):
         env = ba_torchrl.make_vector_env(
-            TASK, 2, parallel=parallel, start_method="spawn", obs_size=16, seed=5
+            TASK, 2, parallel=parallel, start_method="fork", obs_size=16, seed=5
         )
         rollouts.append(env.rollout(6, policy, break_when_any_done=False))
         env.close()

@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 from functools import partial
 
 import gymnasium
@@ -18,6 +16,7 @@ from ba_torchrl.core.errors import ConfigError, SimulationError
 from ba_torchrl.envs.vector.batching import Vector
 from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.testing.episodes import image_of
+from tests.fresh import run_script
 from tests.specs import slow_except
 
 TASKS = slow_except(
@@ -380,12 +379,12 @@ def test_another_process_continues_a_pickled_environment(tmp_path):
     state = expert_steps(env, env.reset(), 4)
     (tmp_path / "env.pickle").write_bytes(pickle.dumps((env, state)))
     code = (
-        "import pathlib, pickle, sys; folder = pathlib.Path(sys.argv[1])\n"
-        "env, state = pickle.loads((folder / 'env.pickle').read_bytes())\n"
+        "import pathlib, pickle\n"
+        "env, state = pickle.loads(pathlib.Path('env.pickle').read_bytes())\n"
         "following = env.step(state.set('action', state['expert_action']))['next']\n"
-        "(folder / 'next.pickle').write_bytes(pickle.dumps(following))"
+        "pathlib.Path('next.pickle').write_bytes(pickle.dumps(following))"
     )
-    subprocess.run([sys.executable, "-c", code, str(tmp_path)], check=True)
+    run_script(tmp_path, code)
     there = pickle.loads((tmp_path / "next.pickle").read_bytes())
     here = env.step(state.set("action", state["expert_action"]))["next"]
     assert (here == there).all()

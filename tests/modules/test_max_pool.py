@@ -1,7 +1,5 @@
 """ReLU of max pooling against PyTorch's functions."""
 
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from itertools import chain
 from threading import Barrier
@@ -15,6 +13,7 @@ from torch.utils.flop_counter import FlopCounterMode
 from ba_torchrl.modules.steerable import cpu_threads
 from ba_torchrl.modules.steerable.cpu_threads import in_parts
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
+from tests.fresh import run_script
 
 LAYOUTS = {"contiguous": torch.contiguous_format, "channels-last": torch.channels_last}
 
@@ -138,8 +137,8 @@ threading.Thread(target=later).start()
 """
 
 
-def test_threads_that_outlive_the_main_thread_work_on():
-    done = subprocess.run([sys.executable, "-c", END], capture_output=True, text=True, timeout=60)
+def test_threads_that_outlive_the_main_thread_work_on(tmp_path):
+    done = run_script(tmp_path, END)
     assert done.stdout == "[2, 4]\n", done.stderr
 
 

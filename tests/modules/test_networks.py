@@ -2,8 +2,6 @@
 
 import copy
 import pickle
-import subprocess
-import sys
 
 import pytest
 import torch
@@ -12,6 +10,7 @@ from pydantic import ValidationError
 from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import compute_dtype
+from tests.fresh import run_script
 from tests.modules.networks import ACTOR_CRITICS, count
 from tests.modules.networks import actor_critic as small
 from tests.specs import actor_critic_spec
@@ -178,7 +177,7 @@ def test_bad_action_sequences_are_refused(sequence):
         actor_critic_spec(64, sequence)
 
 
-def test_missing_escnn_names_the_fix():
+def test_missing_escnn_names_the_fix(tmp_path):
     """The registry can be imported without escnn; building an equivariant network needs it."""
     code = """
 import sys
@@ -207,5 +206,4 @@ except MissingPackageError as error:
 else:
     raise SystemExit("built equi without joblib")
 """
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert result.returncode == 0, result.stderr
+    run_script(tmp_path, code)

@@ -1,8 +1,5 @@
 """escnn without its dependencies for rotations in space."""
 
-import subprocess
-import sys
-
 import pytest
 
 from tests.fresh import run_script
@@ -71,7 +68,5 @@ assert np.allclose(np.abs(kernel), [[0.0], [1.0]]), kernel
 """
 
 
-def test_kernels_are_found_beside_scikit_learn():
-    command = [sys.executable, "-c", BESIDE_SCIKIT_LEARN]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+def test_kernels_are_found_beside_scikit_learn(tmp_path):
+    run_script(tmp_path, BESIDE_SCIKIT_LEARN)

@@ -11,11 +11,10 @@ from recipes.soak import TABLE_FILE, SoakFigures, SoakJob, run_soak
 JOB = SoakJob(task="close_loop/block_reaching", steps=60, env={"obs_size": 16, "max_steps": 10})
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def figures():
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(soak, "SAMPLES", 8)  # each collects the garbage of the whole test session
-        return soak.soak(JOB)
+    rates = {"expert_success": 1.0, "memory_mb": 200.0, "memory_growth": 0.0, "steps_per_s": 9.0}
+    return SoakFigures(job=JOB, episodes=6, faults=0, clients_left=0, **rates)
 
 
 def worker(folder, figures, code=""):
@@ -36,7 +35,10 @@ def calls(folder):
     return (folder / "calls").read_text().split()
 
 
-def test_the_figures_of_a_task(figures):
+@pytest.mark.slow
+def test_the_figures_of_a_task(monkeypatch):
+    monkeypatch.setattr(soak, "SAMPLES", 8)  # each collects the garbage of the whole test session
+    figures = soak.soak(JOB)
     assert figures.job == JOB
     assert figures.episodes >= 6
     assert figures.expert_success > 0.5

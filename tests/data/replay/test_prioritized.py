@@ -1,8 +1,6 @@
 """Segment trees and the expert-prioritised sampler, against the formulas."""
 
 import copy
-import subprocess
-import sys
 import time
 
 import numpy as np
@@ -21,6 +19,7 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.files import read_state, write_state
 from ba_torchrl.data.replay import segment_tree
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
+from tests.fresh import run_script
 
 EPS = 1e-6
 segment_tree.use_python_segment_trees()
@@ -90,11 +89,10 @@ def test_native_trees_are_kept(monkeypatch):
 
 
 OF_TORCHRL = """
-import sys
+import warnings
+warnings.simplefilter("error", UserWarning)
 import torch
 import ba_torchrl
-
-assert "torchrl" not in sys.modules
 from torchrl.data.replay_buffers.samplers import prioritized
 
 native = dict(vars(prioritized))
@@ -134,9 +132,9 @@ sample = buffer.sample()
 sample["td_error"] = errors[sample["x"]]
 buffer.update_tensordict_priority(sample)
 check(buffer)
-buffer.dumps(sys.argv[1])
+buffer.dumps("buffer")
 other = make()
-other.loads(sys.argv[1])
+other.loads("buffer")
 check(other)
 third = make()
 third.load_state_dict(buffer.state_dict())
@@ -145,10 +143,7 @@ check(third)
 
 
 def test_prioritised_buffers_of_torchrl_work_after_one_call_and_not_by_an_import(tmp_path):
-    folder = str(tmp_path / "buffer")
-    command = [sys.executable, "-W", "error::UserWarning", "-c", OF_TORCHRL, folder]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    assert done.returncode == 0, done.stderr
+    done = run_script(tmp_path, OF_TORCHRL)
     assert "C++" not in done.stdout + done.stderr  # TorchRL's warning of its trees
 
 

@@ -2,8 +2,6 @@
 
 import os
 import signal
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -16,6 +14,7 @@ import ba_torchrl
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector import parallel
+from tests.fresh import start_script
 
 PARENT = """
 import os, signal, sys, time
@@ -86,26 +85,34 @@ def test_no_worker_survives_its_parent(tmp_path, how, method):
     parent, pids = start_parent(tmp_path, script)
     if how == "killed":
         parent.kill()
-    assert parent.wait(10) == (-signal.SIGKILL if how == "killed" else 0)
+    parent.join(10)
+    assert parent.exitcode == (-signal.SIGKILL if how == "killed" else 0)
     assert wait_until_gone(pids)
 
 
 def test_workers_of_a_thread_survive_the_thread_but_not_the_process(tmp_path):
     parent, pids = start_parent(tmp_path, THREAD.format(tests=str(FAKES)))
-    assert parent.stdout.readline() == "stepped after the end of the thread\n"
+    assert printed(tmp_path, 2)[1] == "stepped after the end of the thread"
     parent.kill()
-    parent.wait(10)
+    parent.join(10)
     assert wait_until_gone(pids)
 
 
 def start_parent(folder, source):
     """Start a script that prints the ids of its three workers; return its process and the ids."""
-    script = folder / "parent.py"
-    script.write_text(source)
-    parent = subprocess.Popen([sys.executable, str(script)], stdout=subprocess.PIPE, text=True)
-    pids = [int(pid) for pid in parent.stdout.readline().split()]
+    parent = start_script(folder, source)
+    pids = [int(pid) for pid in printed(folder, 1)[0].split()]
     assert len(pids) == 3
     return parent, pids
+
+
+def printed(folder, count):
+    """Wait for lines of a script's output, and return them."""
+    out, deadline = folder / "stdout", time.monotonic() + 60
+    while not out.exists() or out.read_text().count("\n") < count:
+        assert time.monotonic() < deadline, (folder / "stderr").read_text()
+        time.sleep(0.02)
+    return out.read_text().splitlines()
 
 
 def test_a_trickle_of_deaths_does_not_end_the_environments(make_fakes):
