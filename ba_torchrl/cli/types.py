@@ -17,7 +17,7 @@ from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import check_has_structure
+from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
 MAX_NAME_BYTES = 230
 """Longest name of a file that a command writes. File systems allow 255 bytes, of which temporary

@@ -35,7 +35,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import complete_only
 from ba_torchrl.envs.settings import check_env, resolve_env
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.tasks.structures.base import check_has_structure
+from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
 if TYPE_CHECKING:
     from ba_torchrl.training.graded import GradedSets

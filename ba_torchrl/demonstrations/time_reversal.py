@@ -21,8 +21,8 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.open_loop import OpenLoopEnv
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
-from ba_torchrl.tasks.structures.base import check_has_structure
 from ba_torchrl.tasks.structures.deconstruction import Deconstruction, UndoRecorder
+from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
 _ENDS = (
     keys.REWARD,

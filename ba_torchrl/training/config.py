@@ -19,7 +19,7 @@ from ba_torchrl.core.errors import ConfigError, install_command
 from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.record.logging import Backend
-from ba_torchrl.tasks.structures.base import check_has_structure
+from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
 if TYPE_CHECKING:
     import torch

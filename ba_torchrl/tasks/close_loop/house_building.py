@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import COLORS, CloseLoopStructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
+from ba_torchrl.tasks.structures.close_loop import COLORS, CloseLoopStructureTask
 from ba_torchrl.tasks.structures.pieces import cube, triangle
 
 

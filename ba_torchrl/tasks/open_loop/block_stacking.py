@@ -6,8 +6,8 @@ from typing import Literal
 
 from ba_torchrl.core.config import TaskParameters
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.pieces import cube, cylinder
 
 BLOCKS = {"cube": cube, "cylinder": cylinder}

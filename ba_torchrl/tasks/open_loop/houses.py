@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, tower
 from ba_torchrl.tasks.structures.improvise import START_GAP_M, any_cuboid, any_shape, shape_span
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span, roof, triangle
 
 

@@ -151,21 +151,6 @@ class SlotAssigner:
             ]
         return misplaced
 
-    def bodies_above(self) -> dict[Body, frozenset[Body]]:
-        """Return for each piece all pieces that it supports, directly or through others."""
-        bodies_above: dict[Body, frozenset[Body]] = {}
-        # from the top down: a piece is higher than its supports
-        for body in sorted(self.pieces, key=lambda piece: -self.states[piece].position[2]):
-            supported = {
-                other
-                for other, state in self.states.items()
-                if other is not self.held and body in state.supports
-            }
-            bodies_above[body] = frozenset(
-                supported.union(*(bodies_above[other] for other in supported))
-            )
-        return bodies_above
-
     def _candidates(self, assignment: Assignment) -> Iterator[Body]:
         """Yield the bodies that can fill the next slot of a partial assignment."""
         number = len(assignment)

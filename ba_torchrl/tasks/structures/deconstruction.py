@@ -28,10 +28,10 @@ from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.manipulation.commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.manipulation.footprints import extents_m, separation_m
 from ba_torchrl.tasks.structures.assignment import mean_position
-from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Slot
-from ba_torchrl.tasks.structures.experts import PickPlaceExpert
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
+from ba_torchrl.tasks.structures.open_loop import StructureTask
+from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
 from ba_torchrl.tasks.workspace import Spacing, random_points
 

@@ -2,19 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
-from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
+from ba_torchrl.sim.bodies import Body, footprint_radius_m, world_vertices
 from ba_torchrl.tasks.terrain.flat import Terrain
 from ba_torchrl.tasks.workspace import Region
-
-LEVEL_M = 1e-3
-"""Tolerance of the height at which a bridge rests on a piece beside its supports."""
 
 
 class PlacementArea(NamedTuple):
@@ -82,27 +77,3 @@ def placement_deficit_m(
 def extent_along_m(body: Body, directions: np.ndarray) -> np.ndarray:
     """Return the extent [N] of a body from its origin along horizontal unit vectors [N, 2]."""
     return ((world_vertices(body)[:, :2] - body.position[:2]) @ directions.T).max(axis=0)
-
-
-def beside_supports(bridge: Body, supports: Sequence[Body], others: Sequence[Body]) -> list[Body]:
-    """Return the bodies beside two supports on which a bridge would rest, too.
-
-    Args:
-        supports: its supports; a piece with fewer than two is no bridge.
-        others: bodies that are not part of the structure.
-    """
-    if len(supports) != 2:
-        return []
-    (ax, ay, _), (bx, by, _) = (support.position for support in supports)
-    low, high = bridge.shape.bounds_m
-    half_x, half_y = ((b - a) / 2 for a, b in zip(low[:2], high[:2], strict=True))
-    yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
-    covered = Rectangle((ax + bx) / 2, (ay + by) / 2, yaw, half_x, half_y)
-    top = max(vertical_extent(support)[1] for support in supports) - LEVEL_M
-    return [
-        other
-        for other in others
-        if other is not bridge
-        and vertical_extent(other)[1] > top
-        and gap_m(covered, outline(other)) < 0
-    ]

@@ -1,8 +1,8 @@
 """A structure: a cuboid across two cubes."""
 
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.pieces import cube, cuboid, pair_span
 
 

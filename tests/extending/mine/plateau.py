@@ -2,8 +2,8 @@
 
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.base import StructureTask
 from ba_torchrl.tasks.structures.blueprint import Blueprint, tower
+from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.pieces import cube
 from ba_torchrl.tasks.terrain.flat import Terrain
 

@@ -9,7 +9,7 @@ from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.tasks.structures.assignment import SlotAssigner, read_piece_states
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, Span
 from ba_torchrl.tasks.structures.free_space import PlacementArea
-from ba_torchrl.tasks.structures.grasps import Grasps
+from ba_torchrl.tasks.structures.moves import Grasps
 from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF
 from ba_torchrl.tasks.structures.planner import next_move
 from ba_torchrl.tasks.terrain.flat import Flat

@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.tasks.structures.experts import PickPlaceExpert
 from ba_torchrl.tasks.structures.improvise import (
     CUBOID_M,
     NUMBERS,
@@ -14,6 +13,7 @@ from ba_torchrl.tasks.structures.improvise import (
     random_shapes,
     shape_piece,
 )
+from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.planner import next_move
 
 B = 0.03

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ba_torchrl.tasks.structures.blueprint import tower
-from ba_torchrl.tasks.structures.grasps import Grasps
+from ba_torchrl.tasks.structures.moves import Grasps
 from ba_torchrl.tasks.structures.pieces import CUBE, TRIANGLE
 from tests.tasks.structures.scenes import AREA, BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, B
 

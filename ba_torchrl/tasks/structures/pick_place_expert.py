@@ -1,15 +1,14 @@
-"""Experts of structures: the commands for the planner's next move, from any state of the scene."""
+"""Expert of structures in open loop: the pick or place of the planner's next move."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 
-from ba_torchrl.core.actions import GripperCommand, PickPlaceCommand, wrap_angle
+from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix, quaternion_yaw
-from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.manipulation.commands import (
     carrying_pose,
     no_op,
@@ -19,32 +18,17 @@ from ba_torchrl.tasks.manipulation.commands import (
     swaps_fingers,
 )
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
-from ba_torchrl.tasks.manipulation.primitives import (
-    OPEN,
-    grasped_body,
-    lift,
-    nearest_equivalent_yaw,
-)
-from ba_torchrl.tasks.manipulation.transport import carry_to, pick_up
 from ba_torchrl.tasks.structures.free_space import PlacementArea
-from ba_torchrl.tasks.structures.grasps import (
-    SUFFICIENT_CLEARANCE_M,
-    CloseLoopGrasps,
-    GraspCandidate,
-    Move,
-    PickPlaceGrasps,
-)
+from ba_torchrl.tasks.structures.grasps import SUFFICIENT_CLEARANCE_M, PickPlaceGrasps, Tilted
+from ba_torchrl.tasks.structures.moves import Move
 from ba_torchrl.tasks.structures.planner import next_move
-from ba_torchrl.tasks.structures.structure import Structure
+from ba_torchrl.tasks.structures.repair import piece_to_pick
 from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
-from ba_torchrl.tasks.workspace import ActionLimits
 
 RELEASE_YAWS = 8
 """Yaws per half turn that are compared for a place with any yaw."""
 BORDER_BLOCKS = 1.5
 """Distance of placements from the border of their area, in blocks."""
-CLOSE_LOOP_BORDER_BLOCKS = 1.2
-"""The same in close loop."""
 
 
 class PickPlaceExpert:
@@ -65,17 +49,18 @@ class PickPlaceExpert:
             return no_op(self.terrain.workspace, held is not None)
         if move.body is held:
             return self._place(move)
-        body = self._unblocking(move.body)
+        body = piece_to_pick(move.body, self.grasps)
         if self.limits.turn_rad and not self.grasps.is_free(body):
-            # straight down, so that the arm reaches it with any deviation
-            upright = self.grasps.best(body)._replace(tool=None)
-            grasp = self.grasps.tool_pose(body, upright)
-            return perturbed_pick(self.structure.world, body, grasp, self.limits)
+            grasp = self.grasps.attempt(body)
+            if isinstance(grasp, Tilted):  # straight down, the arm reaches it with any deviation
+                grasp = grasp.upright()
+            tool = self.grasps.tool_pose(body, grasp)
+            return perturbed_pick(self.structure.world, body, tool, self.limits)
         return self.pick(body)
 
     def pick(self, body: Body) -> PickPlaceCommand:
         """Return the pick of a body at its best grasp."""
-        return pick_command(self.grasps.tool_pose(body, self.grasps.best(body)))
+        return pick_command(self.grasps.tool_pose(body, self.grasps.attempt(body)))
 
     def placement_area(self) -> PlacementArea:
         """Return where pieces may be placed on the ground."""
@@ -87,26 +72,6 @@ class PickPlaceExpert:
             gap_m=2.0 * self.structure.block_m,
             # fingers at yaw 0 close along x, on pieces that lie along y
             line_yaw_rad=None if self.limits.turn_rad else math.pi / 2,
-        )
-
-    def _unblocking(self, body: Body) -> Body:
-        """Return the piece to pick so that a body can be picked.
-
-        This is the body itself if it has a grasp with clearance, else a piece outside of the
-        structure that blocks its grasps and has one. A gripper that cannot turn pushes them.
-        """
-        if not self.limits.turn_rad or self.grasps.is_free(body):
-            return body
-        placed = self.structure.assigner(None).placed()
-        return next(
-            (
-                other
-                for other in self.grasps.others(body)
-                if other not in placed
-                and all(self.grasps.blocks_grasp(body, other, None))
-                and self.grasps.is_free(other)
-            ),
-            body,
         )
 
     def _place(self, move: Move) -> PickPlaceCommand:
@@ -167,9 +132,8 @@ class PickPlaceExpert:
         gripper, (x, y, z) = self.robot.gripper, tool.position
         rotation = quaternion_matrix(tool.orientation)
         lowest = self.terrain.lowest_tool_m(gripper, (x, y), rotation, self.robot.opening())
-        candidate = GraspCandidate(tool.yaw_rad, tool=tool.orientation)
         (clearance_m,) = self.grasps.clearances_m(
-            move.body, [candidate], self.grasps.others(move.body), tool.position
+            move.body, [Tilted(tool.orientation)], self.grasps.others(move.body), tool.position
         )
         return min(clearance_m, SUFFICIENT_CLEARANCE_M) - max(lowest - z, 0.0)
 
@@ -180,37 +144,3 @@ class PickPlaceExpert:
             for yaw in yaws_rad
         ]
         return yaws_rad[clearances.index(max(clearances))]
-
-
-def gripper_command(structure: Structure, robot: Robot, limits: ActionLimits) -> GripperCommand:
-    """Return the close-loop command of the planner's next move."""
-    held, grasps = grasped_body(robot), CloseLoopGrasps(structure, robot, limits)
-    region = structure.terrain.build_area.shrunk(CLOSE_LOOP_BORDER_BLOCKS * structure.block_m)
-    area = PlacementArea(structure.terrain, region, region, gap_m=structure.block_m)
-    move = next_move(structure.assigner(held), area, grasps)
-    if move is None:
-        return lift(limits.step_m, OPEN)
-    pieces, ceiling_m = list(structure.pieces), structure.terrain.workspace.z[1]
-    if move.body is not held:
-        return pick_up(
-            robot,
-            move.body,
-            limits,
-            yaws_rad=grasps.yaws(move.body),
-            obstacles=pieces,
-            ceiling_m=ceiling_m,
-        )
-    target_yaw = None
-    if move.yaw_rad is not None:
-        yaw = robot.tool_pose()[1]
-        turn = move.yaw_rad - move.piece.yaw_rad(held)
-        target_yaw = nearest_equivalent_yaw(yaw, yaw + turn, limits, move.yaw_period_rad)
-    return carry_to(
-        robot,
-        held,
-        move.position,
-        limits,
-        yaw_rad=target_yaw,
-        obstacles=pieces,
-        ceiling_m=ceiling_m,
-    )
