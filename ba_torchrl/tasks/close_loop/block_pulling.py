@@ -13,13 +13,8 @@ from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import BLUE, RED, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
-from ba_torchrl.tasks.manipulation.primitives import (
-    STANDOFF_M,
-    behind_point,
-    has_room_behind,
-    push,
-)
 from ba_torchrl.tasks.manipulation.progress import nearness, reach_behind, staged
+from ba_torchrl.tasks.manipulation.pushing import STANDOFF_M, Push, behind_point, has_room_behind
 
 NO_ROOM_COST_M = 1.0
 """Cost of a block with no room behind it for the gripper."""
@@ -80,7 +75,7 @@ class BlockPulling(CloseLoopTask):
         pulled, other = min(
             (tuple(self.blocks), tuple(reversed(self.blocks))), key=lambda pair: self._cost(*pair)
         )
-        return push(
+        return Push(
             self.robot,
             pulled,
             other.position[:2],
@@ -88,7 +83,7 @@ class BlockPulling(CloseLoopTask):
             limits=self.action_limits,
             opening=0.5,  # a corner of the block would fit between fully open fingers
             stop_short_m=self._stop_short_m(pulled, other),
-        )
+        ).command()
 
     def _stop_short_m(self, pulled: Body, other: Body) -> float:
         """Return the distance before the other block's centre at which the pull ends.

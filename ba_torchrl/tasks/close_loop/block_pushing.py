@@ -14,8 +14,8 @@ from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.tasks.base import BLOCK_M, GREEN, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
-from ba_torchrl.tasks.manipulation.primitives import push
 from ba_torchrl.tasks.manipulation.progress import nearness, reach_behind, staged
+from ba_torchrl.tasks.manipulation.pushing import Push
 
 
 @TASKS.register("close_loop/block_pushing")
@@ -69,7 +69,7 @@ class BlockPushing(CloseLoopTask):
 
         The gap between them decreases with the size of the block, so that it never fits in between.
         """
-        return push(
+        return Push(
             self.robot,
             self.block,
             self.goal.position[:2],
@@ -77,7 +77,7 @@ class BlockPushing(CloseLoopTask):
             limits=self.action_limits,
             opening=0.5 - max(BLOCK_M - self.block_m, 0.0) / (2 * self.robot.gripper.half_gap_m),
             stop_short_m=0.035,
-        )
+        ).command()
 
     @property
     def landmarks(self) -> Sequence[YawPose]:

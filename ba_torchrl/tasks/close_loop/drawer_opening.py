@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from enum import Enum, auto
 from typing import ClassVar
 
 import numpy as np
@@ -133,7 +134,7 @@ class DrawerOpening(CloseLoopTask):
 
     def evaluate(self) -> dict[str, bool]:
         """Return whether the drawer is open by more than 15 cm."""
-        return {"is_open": self.cabinet.travel_m > self._goal_m}
+        return {"is_open": self.cabinet.travel_m > self.goal_m}
 
     def instruction(self) -> str:
         """Return the instruction with the cabinet's colour."""
@@ -154,95 +155,12 @@ class DrawerOpening(CloseLoopTask):
         )
         return staged(
             nearness(math.hypot(*offset) + turn_m(robot, [heading + math.pi / 2])),
-            share(self.cabinet.travel_m, 0.0, self._goal_m),
+            share(self.cabinet.travel_m, 0.0, self.goal_m),
         )
 
     def expert_command(self) -> GripperCommand:
-        """Descend behind the handle with closed fingers and pull it.
-
-        Behind the rod, between the posts, the fingers turn in place, descend, and pull once their
-        tips are below its axis. They also descend there from where they have a free way, and turn
-        meanwhile. Elsewhere they move and turn over the cabinet and the rod.
-        """
-        robot, limits, scale = self.robot, self.action_limits, self.settings.scale
-        (x, y, z), yaw = robot.tool_pose()
-        (rx, ry, rz), heading = self.handle_pose
-        handle = PlanarFrame(rx, ry, heading)
-        ahead, across = handle.to_local(x, y)
-        target_yaw = nearest_equivalent_yaw(yaw, heading + math.pi / 2, limits, math.pi)
-        turn = abs(wrap_angle(target_yaw - yaw))
-        radius = ROD_DIAMETER_M / 2 * scale
-        front = -ROD_OFFSET_M * scale
-        hook_z = rz - HOOK_DEPTH_M * scale
-        finger, tips_m = robot.gripper.half_width_m, tips_below_tool_m(robot)
-        is_closed = robot.opening() < IS_CLOSED
-        gap = min(DESCENT_GAP_M, (-radius - front) / 2 - finger)
-        behind = -radius - finger - gap
-        hx, hy = handle.to_world(behind, 0.0)
-        is_in_slot = (
-            z - tips_m < rz + radius
-            and front < ahead < -radius
-            and abs(across) < POST_GAP_M / 2 * scale - finger
-        )
-        if is_closed and is_in_slot:
-            if turn >= HOOK_YAW_RAD:
-                return move_toward(robot, (hx, hy, z), target_yaw, CLOSED)
-            if z - tips_m < rz - LEAST_HOOK_M:
-                to_rod = -ahead - radius - finger
-                remaining = self._goal_m + OVERSHOOT_M - self.cabinet.travel_m + to_rod
-                longest = limits.step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
-                target = handle.to_world(ahead + min(remaining, longest), 0.0)
-                return move_toward(robot, (*target, hook_z), target_yaw, CLOSED)
-        if is_closed and (is_in_slot or self._can_descend(behind, (ahead, across, z), turn)):
-            return move_toward(robot, (hx, hy, hook_z), target_yaw, CLOSED)
-        reach = finger * math.cos(turn) + self._half_span_m() * math.sin(turn)
-        top = CABINET_M[2] * scale if ahead - reach < front else rz + radius
-        over_z = top + passing_height_m(robot.gripper)
-        if z < over_z - HEIGHT_TOLERANCE_M:
-            opening = CLOSED if turn < math.pi / 4 else robot.opening()  # the rod may be between
-            return move_toward(robot, (x, y, over_z), target_yaw, opening)
-        return move_toward(robot, (hx, hy, min(z, over_z)), target_yaw, CLOSED)
-
-    def _can_descend(self, behind: float, tool: Vector, turn: float) -> bool:
-        """Return whether closed fingers can descend behind the rod, and turn meanwhile.
-
-        They can if they are aligned, or clear of cabinet, rod, front and posts when their tips
-        pass the tops of these on the straight way. A learner's errors in yaw and position then
-        lead to the slot behind the rod, and not to another ascent.
-
-        Args:
-            behind: target of the descent along the handle's direction of motion.
-            tool: position of the tool along and across that direction from the rod, and height.
-        """
-        robot, limits, scale = self.robot, self.action_limits, self.settings.scale
-        ahead, across, z = tool
-        offset = max(abs(behind - ahead), abs(across))
-        if offset <= ALIGNED_M and turn <= ALIGNED_RAD:
-            return True
-        if offset > limits.step_m or turn > limits.turn_rad + ALIGNED_RAD:
-            return False
-        rod_z, radius = self.handle_pose[0][2], ROD_DIAMETER_M / 2 * scale
-        depth = z - (rod_z - HOOK_DEPTH_M * scale)
-        thick = robot.gripper.half_width_m + SIDE_MARGIN_M
-        wide = self._half_span_m() + SIDE_MARGIN_M
-        front, side = -ROD_OFFSET_M * scale, POST_GAP_M / 2 * scale
-        for top_z, rear, side_m in (
-            (CABINET_M[2] * scale, math.inf, math.inf),
-            (rod_z + radius, -radius, side),
-        ):
-            above = max(z - tips_below_tool_m(robot) - top_z, 0.0)
-            left = 1.0 - min(above / depth, 1.0) if above else 1.0
-            cos, sin = math.cos(left * turn), math.sin(left * turn)
-            along, reach = behind + left * (ahead - behind), thick * cos + wide * sin
-            aside = left * abs(across) + wide * cos + thick * sin
-            if along - reach < front or along + reach > rear or aside > side_m:
-                return False
-        return True
-
-    def _half_span_m(self) -> float:
-        """Return the distance of the fingers' outer sides from the tool point."""
-        gripper = self.robot.gripper
-        return gripper.finger_reach_m - (1.0 - self.robot.opening()) * gripper.half_gap_m
+        """Descend behind the handle with closed fingers and pull it."""
+        return _Pull(self).command()
 
     @property
     def handle_pose(self) -> YawPose:
@@ -265,7 +183,8 @@ class DrawerOpening(CloseLoopTask):
         return ()
 
     @property
-    def _goal_m(self) -> float:
+    def goal_m(self) -> float:
+        """Least travel of the drawer at success, metres."""
         return self.goal_travel_m * self.settings.scale
 
     def _can_be_opened(self) -> bool:
@@ -275,8 +194,141 @@ class DrawerOpening(CloseLoopTask):
         behind = -ROD_DIAMETER_M - BEHIND_ROD_M
         return all(
             self.settings.workspace.contains((x + s * ux, y + s * uy, z - HOOK_DEPTH_M))
-            for s in (behind, self._goal_m)
+            for s in (behind, self.goal_m)
         )
+
+
+class PullPhase(Enum):
+    """What the gripper does next; the first phase whose condition holds."""
+
+    TURN = auto()
+    """Behind the rod, between the posts, the fingers turn in place."""
+    PULL = auto()
+    """They are there, and their tips below the axis of the rod: they pull."""
+    DESCEND = auto()
+    """They descend there, or from where they have a free way, and turn meanwhile."""
+    RISE = auto()
+    """Elsewhere they rise over cabinet and rod."""
+    APPROACH = auto()
+    """They move and turn over cabinet and rod."""
+
+
+class _Pull:
+    """The expert's pull in the present scene.
+
+    Coordinates of the tool are along the direction of the pull and across it, from the rod's axis.
+    """
+
+    def __init__(self, task: DrawerOpening) -> None:
+        self.task = task
+        self.robot = robot = task.robot
+        self.scale = scale = task.settings.scale
+        self.position, yaw = robot.tool_pose()
+        (rx, ry, self.rod_z_m), self.heading_rad = task.handle_pose
+        self.handle = PlanarFrame(rx, ry, self.heading_rad)
+        self.ahead_m, self.across_m = self.handle.to_local(*self.position[:2])
+        self.yaw_rad = nearest_equivalent_yaw(
+            yaw, self.heading_rad + math.pi / 2, task.action_limits, math.pi
+        )
+        self.turn_rad = abs(wrap_angle(self.yaw_rad - yaw))
+        self.radius_m = ROD_DIAMETER_M / 2 * scale
+        self.front_m = -ROD_OFFSET_M * scale
+        self.side_m = POST_GAP_M / 2 * scale
+        self.hook_z_m = self.rod_z_m - HOOK_DEPTH_M * scale
+        self.finger_m = robot.gripper.half_width_m
+        self.tips_z_m = self.position[2] - tips_below_tool_m(robot)
+        gap_m = min(DESCENT_GAP_M, (-self.radius_m - self.front_m) / 2 - self.finger_m)
+        self.behind_m = -self.radius_m - self.finger_m - gap_m
+        self.behind = self.handle.to_world(self.behind_m, 0.0)
+
+    def command(self) -> GripperCommand:
+        """Return the next command."""
+        z = self.position[2]
+        match self.phase():
+            case PullPhase.TURN:
+                return move_toward(self.robot, (*self.behind, z), self.yaw_rad, CLOSED)
+            case PullPhase.PULL:
+                return self._pull()
+            case PullPhase.DESCEND:
+                target = (*self.behind, self.hook_z_m)
+                return move_toward(self.robot, target, self.yaw_rad, CLOSED)
+            case PullPhase.RISE:
+                # the rod may be between the fingers
+                opening = CLOSED if self.turn_rad < math.pi / 4 else self.robot.opening()
+                target = (*self.position[:2], self._over_z_m())
+                return move_toward(self.robot, target, self.yaw_rad, opening)
+            case PullPhase.APPROACH:
+                target = (*self.behind, min(z, self._over_z_m()))
+                return move_toward(self.robot, target, self.yaw_rad, CLOSED)
+
+    def phase(self) -> PullPhase:
+        """Return the phase of the present scene."""
+        if self.robot.opening() < IS_CLOSED:
+            is_in_slot = (
+                self.tips_z_m < self.rod_z_m + self.radius_m
+                and self.front_m < self.ahead_m < -self.radius_m
+                and abs(self.across_m) < self.side_m - self.finger_m
+            )
+            if is_in_slot and self.turn_rad >= HOOK_YAW_RAD:
+                return PullPhase.TURN
+            if is_in_slot and self.tips_z_m < self.rod_z_m - LEAST_HOOK_M:
+                return PullPhase.PULL
+            if is_in_slot or self._can_descend():
+                return PullPhase.DESCEND
+        is_low = self.position[2] < self._over_z_m() - HEIGHT_TOLERANCE_M
+        return PullPhase.RISE if is_low else PullPhase.APPROACH
+
+    def _pull(self) -> GripperCommand:
+        to_rod_m = -self.ahead_m - self.radius_m - self.finger_m
+        remaining_m = self.task.goal_m + OVERSHOOT_M - self.task.cabinet.travel_m + to_rod_m
+        heading = self.heading_rad
+        step_m = self.task.action_limits.step_m
+        longest_m = step_m / max(abs(math.cos(heading)), abs(math.sin(heading)))
+        target = self.handle.to_world(self.ahead_m + min(remaining_m, longest_m), 0.0)
+        return move_toward(self.robot, (*target, self.hook_z_m), self.yaw_rad, CLOSED)
+
+    def _over_z_m(self) -> float:
+        """Return the height of a tool that passes over what is below it: cabinet, or rod."""
+        reach_m = self.finger_m * math.cos(self.turn_rad)
+        reach_m += self._half_span_m() * math.sin(self.turn_rad)
+        is_over_cabinet = self.ahead_m - reach_m < self.front_m
+        top_m = CABINET_M[2] * self.scale if is_over_cabinet else self.rod_z_m + self.radius_m
+        return top_m + passing_height_m(self.robot.gripper)
+
+    def _can_descend(self) -> bool:
+        """Whether closed fingers can descend behind the rod, and turn meanwhile.
+
+        They can if they are aligned, or clear of cabinet, rod, front and posts when their tips
+        pass the tops of these on the straight way. A learner's errors in yaw and position then
+        lead to the slot behind the rod, and not to another ascent.
+        """
+        limits, turn_rad = self.task.action_limits, self.turn_rad
+        offset_m = max(abs(self.behind_m - self.ahead_m), abs(self.across_m))
+        if offset_m <= ALIGNED_M and turn_rad <= ALIGNED_RAD:
+            return True
+        if offset_m > limits.step_m or turn_rad > limits.turn_rad + ALIGNED_RAD:
+            return False
+        depth_m = self.position[2] - self.hook_z_m
+        thick_m = self.finger_m + SIDE_MARGIN_M
+        wide_m = self._half_span_m() + SIDE_MARGIN_M
+        for top_m, rear_m, side_m in (
+            (CABINET_M[2] * self.scale, math.inf, math.inf),
+            (self.rod_z_m + self.radius_m, -self.radius_m, self.side_m),
+        ):
+            above_m = max(self.tips_z_m - top_m, 0.0)
+            left = 1.0 - min(above_m / depth_m, 1.0) if above_m else 1.0
+            cos, sin = math.cos(left * turn_rad), math.sin(left * turn_rad)
+            along_m = self.behind_m + left * (self.ahead_m - self.behind_m)
+            reach_m = thick_m * cos + wide_m * sin
+            aside_m = left * abs(self.across_m) + wide_m * cos + thick_m * sin
+            if along_m - reach_m < self.front_m or along_m + reach_m > rear_m or aside_m > side_m:
+                return False
+        return True
+
+    def _half_span_m(self) -> float:
+        """Return the distance of the fingers' outer sides from the tool point."""
+        gripper = self.robot.gripper
+        return gripper.finger_reach_m - (1.0 - self.robot.opening()) * gripper.half_gap_m
 
 
 def cabinet_parts() -> tuple[Mesh, ...]:

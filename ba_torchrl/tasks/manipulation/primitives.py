@@ -9,13 +9,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-import numpy as np
-
 from ba_torchrl.core.actions import GripperCommand, wrap_angle
-from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent, world_vertices
+from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m, half_gap_m, passing_height_m
-from ba_torchrl.tasks.workspace import ActionLimits, Workspace
+from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m, passing_height_m
+from ba_torchrl.tasks.workspace import ActionLimits
 
 OPEN, CLOSED = 1.0, 0.0
 """The ends of the range of the gripper's opening."""
@@ -30,21 +28,6 @@ ALIGNED_RAD = 0.08
 """Largest yaw error of a gripper that is aligned with its target."""
 DESCENT_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that descends towards its target."""
-PUSH_HEIGHT_M = 0.02
-"""Height of the tool above the lower bound of the workspace during a push."""
-PUSH_HEIGHT_TOLERANCE_M = 0.015
-"""Largest height above that of a tool that pushes."""
-PUSH_OFFSET_M = 0.015
-"""Largest distance from the line of a tool that pushes."""
-PUSH_YAW_RAD = 0.4
-"""Largest yaw error of a gripper that pushes."""
-PUSH_OVERLAP_M = 0.01
-"""Largest distance of a tool that pushes beyond the rear side of the body."""
-OBSTACLE_SHARE = 0.9
-"""A body is an obstacle of the approach if the path comes closer to it than this share of the
-distance between the body and the start of the push."""
-STANDOFF_M = 0.08
-"""Distance from a body to the point from which it is pushed."""
 
 
 def move_toward(
@@ -93,16 +76,6 @@ def closing(robot: Robot) -> float:
     """
     is_stopped = robot.commanded_opening < IS_CLOSED <= robot.opening()
     return OPEN if is_stopped else CLOSED
-
-
-def release(body: Body, floor_m: float, limits: ActionLimits) -> GripperCommand:
-    """Return the next command to lower the held body to the floor and open the fingers.
-
-    Args:
-        floor_m: height of the floor, metres.
-    """
-    gap = max(vertical_extent(body)[0] - floor_m, 0.0)
-    return lift(-gap, OPEN if gap <= limits.step_m else CLOSED)
 
 
 def lift(height_m: float, opening: float = CLOSED) -> GripperCommand:
@@ -162,136 +135,3 @@ def grasp(robot: Robot, body: Body, limits: ActionLimits) -> GripperCommand:
     if z < above_z - 1e-3 and not is_centered:
         return lift(above_z - z, OPEN)  # a horizontal motion could push the block
     return move_toward(robot, (bx, by, above_z), target_yaw, OPEN)
-
-
-def push(
-    robot: Robot,
-    body: Body,
-    goal: tuple[float, float],
-    *,
-    workspace: Workspace,
-    limits: ActionLimits,
-    opening: float,
-    stop_short_m: float,
-) -> GripperCommand:
-    """Return the next command to push a body along the straight line to a goal.
-
-    The line between the fingers is perpendicular to the line of the push. On the line behind the
-    body the gripper pushes. Elsewhere it first moves behind the body, over its top if the body is
-    an obstacle. The tolerance of the line is larger during the push than at the end of the
-    approach, so that the two phases do not alternate. A held body is released first, and the
-    fingers stay open until they are above it. A body at the border, which leaves no room behind it,
-    is grasped and dragged away from there.
-
-    Args:
-        goal: goal of the tool, metres.
-        stop_short_m: distance before the goal at which the tool stops.
-    """
-    position, yaw = robot.tool_pose()
-    x, y, z = position
-    bx, by, _ = body.position
-    length = math.dist((bx, by), goal)
-    ux, uy = ((goal[0] - bx) / length, (goal[1] - by) / length) if length > 1e-6 else (1.0, 0.0)
-    behind = behind_point(robot, body, (ux, uy), workspace)
-    has_room = has_room_behind(robot, body, behind)
-    held = grasped_body(robot)
-    if held is body and not has_room:
-        travel = min(length, limits.step_m)
-        return GripperCommand(CLOSED, travel * ux, travel * uy, 0.0, 0.0)
-    if held is not None:
-        return release(held, workspace.z[0], limits)
-    if not has_room and fits_between_fingers(robot, body):
-        return grasp(robot, body, limits)
-    along = (x - bx) * ux + (y - by) * uy
-    offset = abs((y - by) * ux - (x - bx) * uy)
-    across = math.atan2(uy, ux) + math.pi / 2
-    target_yaw = nearest_equivalent_yaw(yaw, across, limits, math.pi)
-    turn = abs(wrap_angle(target_yaw - yaw))
-    low_z = workspace.z[0] + PUSH_HEIGHT_M
-
-    half = body.shape.height_m / 2
-    is_low = z < low_z + PUSH_HEIGHT_TOLERANCE_M
-    is_on_line = along < -half + PUSH_OVERLAP_M and offset < PUSH_OFFSET_M
-    if is_low and is_on_line and turn < PUSH_YAW_RAD:
-        distance = math.dist((x, y), goal) - stop_short_m
-        travel = max(min(distance, limits.step_m / max(abs(ux), abs(uy))), 0.0)
-        # towards the goal from the tool, so that its offset from the line decreases
-        gx, gy = goal[0] - x, goal[1] - y
-        norm = math.hypot(gx, gy) or 1.0
-        target = (x + travel * gx / norm, y + travel * gy / norm, low_z)
-        return move_toward(robot, target, target_yaw, opening)
-
-    over_z = body.position[2] + half + passing_height_m(robot.gripper)
-    is_behind = max(abs(behind[0] - x), abs(behind[1] - y)) <= ALIGNED_M and turn <= ALIGNED_RAD
-    is_obstacle = not is_behind and distance_to_segment(
-        (bx, by), (x, y), behind
-    ) < OBSTACLE_SHARE * math.dist(behind, (bx, by))
-    is_around = math.dist((x, y), (bx, by)) < footprint_radius_m(body)
-    moves_away = (behind[0] - x) * (bx - x) + (behind[1] - y) * (by - y) <= 0
-    if is_obstacle and not is_around and moves_away:
-        # The tool keeps its height until it is further out. If it rose here, where it descends
-        # further out, a learner's mean of the two would hover in between.
-        is_above = z + robot.gripper.lowest_tip_m >= body.position[2] + half
-        target_z = min(max(z, low_z), over_z)
-        return move_toward(robot, (*behind, target_z), target_yaw if is_above else yaw, opening)
-    if is_obstacle and z < over_z - 1e-3:
-        stays_open = is_around and robot.commanded_opening >= IS_OPEN
-        return lift(over_z - z, OPEN if stays_open else opening)
-    return move_toward(robot, (*behind, over_z if is_obstacle else low_z), target_yaw, opening)
-
-
-def behind_point(
-    robot: Robot,
-    body: Body,
-    direction: tuple[float, float],
-    workspace: Workspace,
-) -> tuple[float, float]:
-    """Return the point of the workspace from which to push a body.
-
-    It is `STANDOFF_M` from the body's origin; closer near the border, but never so close that the
-    gripper touches the body.
-
-    Args:
-        direction: unit vector of the push.
-    """
-    bx, by, _ = body.position
-    inner = body.shape.mesh().vertices[:, :2]
-    nearest = float((inner**2).sum(axis=1).max() ** 0.5)
-    nearest += robot.gripper.half_width_m
-    limit = STANDOFF_M
-    for b, u, (low, high) in zip((bx, by), direction, (workspace.x, workspace.y), strict=True):
-        if abs(u) > 1e-9:
-            limit = min(limit, (b - (low if u > 0 else high)) / u)
-    back = max(limit, min(nearest, STANDOFF_M))
-    x, y, _ = workspace.clip((bx - back * direction[0], by - back * direction[1], 0.0))
-    return x, y
-
-
-def has_room_behind(robot: Robot, body: Body, behind: tuple[float, float]) -> bool:
-    """Whether a gripper at the point from which to push a body does not touch the body.
-
-    Args:
-        behind: point of `behind_point`.
-    """
-    offset = np.subtract(behind, body.position[:2])
-    distance = float(np.hypot(*offset))
-    if distance == 0.0:
-        return False
-    extent = float(((world_vertices(body)[:, :2] - body.position[:2]) @ offset).max()) / distance
-    return distance > extent + robot.gripper.half_width_m
-
-
-def fits_between_fingers(robot: Robot, body: Body) -> bool:
-    """Whether open fingers fit around a block."""
-    return min(body.shape.bounds_m[1][:2]) < half_gap_m(robot.gripper)
-
-
-def distance_to_segment(
-    point: tuple[float, float], start: tuple[float, float], end: tuple[float, float]
-) -> float:
-    """Return the distance between a point and a line segment."""
-    ex, ey = end[0] - start[0], end[1] - start[1]
-    px, py = point[0] - start[0], point[1] - start[1]
-    square = ex * ex + ey * ey
-    share = min(max((px * ex + py * ey) / square, 0.0), 1.0) if square > 0 else 0.0
-    return math.hypot(px - share * ex, py - share * ey)

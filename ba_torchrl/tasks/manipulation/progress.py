@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from ba_torchrl.core.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.manipulation.primitives import (
+from ba_torchrl.tasks.manipulation.pushing import (
     PUSH_HEIGHT_M,
     PUSH_HEIGHT_TOLERANCE_M,
     behind_point,
