@@ -36,12 +36,13 @@ setup: $(STAMP)
 train: $(STAMP)
 	$(BIN)/ba-torchrl train --config-name quickstart $(ARGS)
 
-# One process per core, each with one thread: numeric libraries would fight over the cores.
+# One process per core, each with one thread: numeric libraries would fight over the cores. The tests
+# of a file run in one process, which builds their environments and kernels once.
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
 
 test-slow: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto -m slow $(ARGS)
+	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m slow $(ARGS)
 
 test-versions: $(STAMP)
 	$(BIN)/python tests/versions.py $(ARGS)

@@ -173,68 +173,17 @@ def test_no_two_files_import_each_other():
     assert circles(imports) == set()
 
 
-def test_a_circle_between_files_is_found():
-    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}, "d": {"a"}}) == {frozenset("abc")}
-    assert circles({"a": {"b"}, "b": {"c"}, "c": set()}) == set()
-
-
 @pytest.mark.parametrize(
     ("module", "source", "culprit"),
     [
-        ("ba_torchrl.sim.world", "import ba_torchrl.tasks.base", "tasks"),
-        ("ba_torchrl.sim.world", "import torch", "torch"),
         ("ba_torchrl.sim.world", "def f():\n    from torch.nn import Linear", "torch.nn"),
-        ("ba_torchrl.tasks.base", "from tensordict import TensorDict", "tensordict"),
         ("ba_torchrl.tasks.base", "from ..envs import keys", "envs"),
-        ("ba_torchrl.tasks.base", "from ba_torchrl import envs", "envs"),
-        ("ba_torchrl.core.registry", "from ba_torchrl.sim import world", "sim"),
-        (
-            "ba_torchrl.envs.base",
-            "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n"
-            "    from ba_torchrl.modules.cnn import CNN",
-            "modules",
-        ),
-        (
-            "ba_torchrl.data.replay.buffer",
-            "from ba_torchrl.algorithms.sac import SAC",
-            "algorithms",
-        ),
-        ("ba_torchrl.modules.cnn", "from ba_torchrl.envs.base import BulletArmEnv", "envs"),
-        ("ba_torchrl.modules.cnn", "from ba_torchrl.objectives.sac import Loss", "objectives"),
-        ("ba_torchrl.objectives.sac", "from ba_torchrl.modules.cnn import CNN", "modules"),
-        ("ba_torchrl.training.loop", "from ba_torchrl.modules.cnn import CNN", "modules"),
-        ("ba_torchrl.algorithms.sac", "from ba_torchrl.record.plots import plot", "record"),
-        ("ba_torchrl.envs.base", "from ba_torchrl import make", "__init__"),
         ("ba_torchrl.modules.cnn", "from ba_torchrl.data import as_transitions", "data"),
-        ("recipes.train", "from ba_torchrl.modules.cnn import CNN", "modules"),
-        ("recipes.torchrl.sac", "from ba_torchrl.algorithms.sac import SAC", "algorithms"),
-        ("recipes.torchrl.sac", "from ba_torchrl.training import experiment", "training"),
     ],
 )
 def test_a_wrong_import_is_found(module, source, culprit):
-    found = violations(source, module, {"ba_torchrl.envs"})
-    assert len(found) == 1
-    assert f"imports {culprit}" in found[0]
-
-
-@pytest.mark.parametrize(
-    ("module", "source"),
-    [
-        ("ba_torchrl.sim.robots.kuka", "import numpy\nfrom ..world import World"),
-        ("ba_torchrl.modules.cnn", "import torch\nfrom ba_torchrl.core import keys"),
-        ("ba_torchrl.modules.cnn", "from ba_torchrl.core.keys import ACTION"),
-        ("ba_torchrl.algorithms.sac", "from ba_torchrl.modules.cnn import CNN"),
-        ("ba_torchrl.training.loop", "from ba_torchrl import make\nimport ba_torchrl.record.plots"),
-        ("recipes.train", "from ba_torchrl.core.malloc import tune_malloc"),
-    ],
-)
-def test_a_right_import_passes(module, source):
-    assert violations(source, module, {"ba_torchrl.core.keys"}) == []
-
-
-def test_a_new_part_must_be_given_a_place():
-    with pytest.raises(ValueError, match="is not in list"):
-        violations("", "ba_torchrl.newcomer")
+    (found,) = violations(source, module, {"ba_torchrl.envs"})
+    assert f"imports {culprit}" in found
 
 
 def loaded_after(imports):

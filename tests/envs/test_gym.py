@@ -326,19 +326,22 @@ def test_closing_closes_the_simulator_and_may_be_repeated(make):
 def test_vectors_give_the_episodes_of_single_environments(make):
     single = [episode(make(), seed=seed, steps=2) for seed in (4, 5)]
     actions = [np.full((2, 5), 0.3 - 0.1 * t, dtype=np.float32) for t in range(2)]
-    for mode, size in {"sync": 2, "async": 1}.items():
-        env = gymnasium.make_vec(PICKING, size, vectorization_mode=mode, obs_size=16, expert=True)
+    options = {"sync": {}, "async": {"vector_kwargs": {"context": "fork"}}}
+    for mode, kwargs in options.items():
+        env = gymnasium.make_vec(
+            PICKING, 2, vectorization_mode=mode, obs_size=16, expert=True, **kwargs
+        )
         try:
-            observation, info = env.reset(seed=[4, 5][:size])
-            assert info["expert_action"].shape == (size, 5)
+            observation, info = env.reset(seed=[4, 5])
+            assert info["expert_action"].shape == (2, 5)
             observations = [observation]
             for action in actions:
-                observation, _, _, _, info = env.step(action[:size])
+                observation, _, _, _, info = env.step(action)
                 observations.append({key: value.copy() for key, value in observation.items()})
-            assert info["step_count"].tolist() == [2] * size
+            assert info["step_count"].tolist() == [2, 2]
         finally:
             env.close()
-        for index in range(size):
+        for index in range(2):
             row = [{key: value[index] for key, value in each.items()} for each in observations]
             assert same(single[index], row), f"{mode}, environment {index}"
 

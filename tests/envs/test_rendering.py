@@ -19,9 +19,11 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.rgb import FOV_DEG, _render, render_rgb
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import Workspace
+from tests.specs import slow_except_two_robots
 from tests.tasks.episodes import follow_expert
 
 STACKING = "open_loop/block_stacking"
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture
@@ -153,12 +155,12 @@ def test_images_of_a_grasp_and_a_release_show_the_hand_at_the_object(make):
     ("task", "settings"),
     [
         ("open_loop/house_building_1", {}),
-        ("open_loop/house_building_1", {"fast_mode": False}),
-        (STACKING, {"robot": "panda", "num_objects": 2}),
-        (STACKING, {"robot": "ur5", "num_objects": 2}),
         (STACKING, {"robot": "ur5_robotiq", "num_objects": 2}),
-        ("ramp/house_building_2", {}),
         ("bump/house_building_4", {"max_steps": 2}),
+        pytest.param("open_loop/house_building_1", {"fast_mode": False}, marks=SLOW),
+        pytest.param(STACKING, {"robot": "panda", "num_objects": 2}, marks=SLOW),
+        pytest.param(STACKING, {"robot": "ur5", "num_objects": 2}, marks=SLOW),
+        pytest.param("ramp/house_building_2", {}, marks=SLOW),
     ],
 )
 def test_videos_and_images_change_no_step(make, task, settings):
@@ -232,7 +234,7 @@ class Motion:
 FILMED = ["open_loop/house_building_3", "ramp/house_building_2", "bump/house_building_4"]
 
 
-@pytest.mark.parametrize("robot", ["kuka", "panda", "ur5", "ur5_robotiq"])
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 @pytest.mark.parametrize("task", FILMED)
 def test_the_arm_of_a_video_moves_between_poses_and_is_in_every_frame(
     make, monkeypatch, task, robot
@@ -252,8 +254,8 @@ def test_the_arm_of_a_video_moves_between_poses_and_is_in_every_frame(
     assert np.ptp(motion.viewpoints, axis=0).max() < 1e-6
 
 
-@pytest.mark.parametrize("robot", ["kuka", "panda", "ur5", "ur5_robotiq"])
-@pytest.mark.parametrize("size_m", [0.3, 0.4])
+@pytest.mark.parametrize("robot", slow_except_two_robots())
+@pytest.mark.parametrize("size_m", [0.4, pytest.param(0.3, marks=SLOW)])
 def test_the_whole_arm_is_in_the_image_at_every_corner_of_the_workspace(make, robot, size_m):
     half = size_m / 2
     env = make(robot=robot, workspace=((0.45 - half, 0.45 + half), (-half, half), (0.0, 0.4)))

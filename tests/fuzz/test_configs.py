@@ -36,7 +36,7 @@ def fields_of(task):
     return EnvConfig.model_fields.keys() | TASKS[task].Parameters.model_fields.keys()
 
 
-@examples(100)
+@examples(40)
 def test_parameters_of_environments(count):
     def prop(values):
         task, changes = values
@@ -88,7 +88,7 @@ def run_values():
     )
 
 
-@examples(100)
+@examples(40)
 def test_configurations_of_runs(count):
     def prop(values):
         try:
@@ -112,7 +112,7 @@ TENSORS = st.tuples(
 ACTIONS = st.one_of(st.none(), TENSORS)
 
 
-@examples(300)
+@examples(100)
 def test_actions_are_valid_or_refused(count):
     env = ba_torchrl.make("close_loop/block_reaching", obs_size=16)
     vector_spec = torch.stack([env.action_spec] * 2)
@@ -135,7 +135,7 @@ def test_actions_are_valid_or_refused(count):
     env.close()
 
 
-@examples(60)
+@examples(30)
 def test_finite_actions_of_any_size_are_executed(count):
     env = ba_torchrl.make("close_loop/block_reaching", obs_size=16, seed=0)
     state = env.reset()

@@ -126,7 +126,7 @@ def altered(folder, sealed, read):
     return prop
 
 
-@examples(60)
+@examples(20)
 def test_demonstrations(demos, count):
     def read(path):
         assert load_demonstrations(path, task=TASK, env=ENV)
@@ -134,7 +134,7 @@ def test_demonstrations(demos, count):
     check(count, CASES, altered(demos, lambda copy: [copy], read))
 
 
-@examples(40)
+@examples(15)
 def test_checkpoints(run, count):
     def sealed(copy):
         return [path.parent for path in copy.rglob(CHECKSUMS_FILE)]
@@ -142,12 +142,12 @@ def test_checkpoints(run, count):
     check(count, CASES, altered(run, sealed, lambda copy: load(copy, "latest")))
 
 
-@examples(100)
+@examples(40)
 def test_states(state, count):
     check(count, CASES, altered(state, lambda copy: [copy], read_state))
 
 
-@examples(150)
+@examples(50)
 def test_results(tmp_path, count):
     def prop(content):
         run = tmp_path / "run"
@@ -168,7 +168,7 @@ ROWS = st.lists(st.lists(st.text(max_size=5), max_size=4).map(",".join), max_siz
 """Files with the columns of scalars and any rows."""
 
 
-@examples(150)
+@examples(50)
 def test_scalars(tmp_path, count):
     path = tmp_path / "scalars.csv"
     path.write_text("step,name,value\n0,loss,1.5\n20,loss,0.5\n20,eval/success_rate,1.0\n")
@@ -188,7 +188,7 @@ def test_scalars(tmp_path, count):
     check(count, st.one_of(DAMAGES, st.tuples(st.just("bytes"), ROWS)), prop)
 
 
-@examples(60)
+@examples(20)
 def test_figures_of_a_soak_test(tmp_path, count):
     job = SoakJob(task=TASK, steps=10)
     figures = {

@@ -38,7 +38,7 @@ CHANGES = st.one_of(
 )
 
 
-@examples(40)
+@examples(15)
 def test_grids(tmp_path, count):
     def prop(changes):
         try:

@@ -54,7 +54,7 @@ def started(*_, **__):
 
 
 @pytest.mark.parametrize("name", WORK)
-@examples(12)
+@examples(5)
 def test_command_lines(name, count, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     module = load_recipe(name)

@@ -78,15 +78,22 @@ def transitions(n=4):
     return TensorDict({**state(), "action": action, "next": following}, [n])
 
 
-@pytest.mark.parametrize("kind", [SACLoss, CQLLoss, IQLLoss, REDQLoss])
+KINDS = [SACLoss, CQLLoss, IQLLoss, REDQLoss]
+CRITICS = [
+    ("cnn", {}),
+    ("cnn", {"depth_reference": "floor", "negative_slope": 0.1}),
+    ("ferm", {"width": 0.125}),
+    ("equi", {}),
+    ("equi_strided", {}),
+]
+
+
 @pytest.mark.parametrize(
-    ("name", "fields"),
+    ("name", "fields", "kind"),
     [
-        ("cnn", {}),
-        ("cnn", {"depth_reference": "floor", "negative_slope": 0.1}),
-        ("ferm", {"width": 0.125}),
-        ("equi", {}),
-        ("equi_strided", {}),
+        pytest.param(*critic, kind, marks=[pytest.mark.slow] * (j != i % len(KINDS)))
+        for i, critic in enumerate(CRITICS)
+        for j, kind in enumerate(KINDS)
     ],
 )
 def test_critics_under_vmap_are_a_loop_over_critics(name, fields, kind):

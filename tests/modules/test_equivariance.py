@@ -49,7 +49,7 @@ def steps(networks, size, action_size, n=3):
     assert any(not torch.equal(p, q) for p, q in zip(parameters, before, strict=True))
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [pytest.param(False, marks=pytest.mark.slow), True])
 @pytest.mark.parametrize(
     ("size", "sequence", "group_order", "options"),
     [
@@ -62,9 +62,9 @@ def steps(networks, size, action_size, n=3):
         (64, "pxyzr", 8, {"name": "equi_strided"}),
         (128, "pxyz", 4, {"name": "equi_strided"}),
         (64, "pxyzr", 4, {"reflections": True}),
-        (64, "pxyz", 8, {"reflections": True}),
         (64, "rzypx", 4, {"reflections": True}),
-        (128, "pxyzr", 4, {"reflections": True}),
+        pytest.param(64, "pxyz", 8, {"reflections": True}, marks=pytest.mark.slow),
+        pytest.param(128, "pxyzr", 4, {"reflections": True}, marks=pytest.mark.slow),
     ],
 )
 def test_quarter_turns_and_reflections_are_exact(size, sequence, group_order, options, trained):

@@ -45,10 +45,12 @@ def test_parameter_counts_of_the_plain_heads_match_the_reference(size, last_map,
     assert all(round(number / 1e6, 1) == pytest.approx(millions, abs=0.05) for number in expected)
 
 
-@pytest.mark.parametrize(("size", "last_map", "millions"), [(24, 3, 36.7), (40, 5, 33.8)])
 @pytest.mark.parametrize(
-    ("scene_head", "of_yaws", "of_poses"),
-    [("flatten", FLATTENED_SCENE, SCENE_MAP), ("pool", SCENE_VECTOR, SCENE_VECTOR)],
+    ("size", "last_map", "millions", "scene_head", "of_yaws", "of_poses"),
+    [
+        (24, 3, 36.7, "flatten", FLATTENED_SCENE, SCENE_MAP),
+        (40, 5, 33.8, "pool", SCENE_VECTOR, SCENE_VECTOR),
+    ],
 )
 def test_parameter_counts_of_the_equivariant_heads(
     size, last_map, millions, scene_head, of_yaws, of_poses

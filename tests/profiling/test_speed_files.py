@@ -87,7 +87,7 @@ def test_a_foreign_file_is_refused_in_one_line(damage, reason, tmp_path, content
     assert "\n" not in str(raised.value)
 
 
-@examples(100)
+@examples(30)
 def test_damaged_files_are_refused(tmp_path, count):
     def prop(data):
         path = tmp_path / "speed.json"

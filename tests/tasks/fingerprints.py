@@ -222,10 +222,10 @@ def is_recorded(task: str, entry: Mapping[str, Any] | None) -> bool:
     )
 
 
-def changes(task: str, entry: Mapping[str, Any]) -> list[str]:
+def changes(task: str, entry: Mapping[str, Any], robots: Sequence[str] | None = None) -> list[str]:
     """Return for each robot how a task or its expert differs from an entry, and what to do."""
     found = []
-    for robot in ROBOTS:
+    for robot in robots or ROBOTS:
         of_task, of_expert, _ = play(task, robot, entry["actions"])
         if differences := _differences(entry[robot]["task"], of_task):
             what, name = f"the episodes of {task}", "version"

@@ -19,6 +19,7 @@ from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
 from ba_torchrl.training.persistence import lock_holder, saved_steps
 from ba_torchrl.training.resume import resumable_updates
+from tests.tasks.episodes import slow
 
 SAC = {
     "task": "close_loop/block_reaching",
@@ -46,9 +47,6 @@ SDQFD = {
     "algorithm": {"name": "spatial_q", "batch_size": 4},
     "network": {"name": "asr", "width": 0.125},
 }
-
-
-SLOW = pytest.mark.slow
 
 
 class Killed(BaseException):
@@ -122,7 +120,7 @@ def undisturbed(tmp_path_factory):
     return run(config_for(tmp_path_factory.mktemp("whole") / "run"))
 
 
-@pytest.mark.parametrize("after", [1, 3, pytest.param(4, marks=SLOW), 20])
+@pytest.mark.parametrize("after", [3, 20, *slow([1, 4])])
 def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, undisturbed, after):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment.algorithm, "update", after, terminate)
@@ -134,7 +132,7 @@ def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, un
     assert read_result(tmp_path).resumed_at == [after]
 
 
-@pytest.mark.parametrize("after", [pytest.param(7, marks=SLOW), 10])
+@pytest.mark.parametrize("after", [10, *slow([7])])
 def test_unfinished_episodes_of_self_imitation_are_continued(tmp_path, after):
     algorithm = {**SAC["algorithm"], "imitate_successes": True}
     whole = Experiment(config_for(tmp_path / "whole", algorithm=algorithm), progress=False)
@@ -174,7 +172,7 @@ def test_a_run_that_was_killed_counts_each_label_once(tmp_path):
     assert record.seconds == pytest.approx(sum(record.phase_seconds.values()))
 
 
-@pytest.mark.parametrize("evaluation", [1, pytest.param(2, marks=SLOW), 3])
+@pytest.mark.parametrize("evaluation", [3, *slow([1, 2])])
 def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evaluation):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment, "_evaluate", evaluation, terminate)
@@ -185,7 +183,7 @@ def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evalua
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@pytest.mark.parametrize("number", [1, *slow([2])])
 def test_a_run_stopped_in_its_tests_keeps_the_last_state(tmp_path, number, monkeypatch):
     def first_or_last(checkpoints, which):
         newest, *_, oldest = saved_steps(checkpoints._folder / "checkpoints")
@@ -205,7 +203,7 @@ def test_a_run_stopped_in_its_tests_keeps_the_last_state(tmp_path, number, monke
     assert_same(run(config_for(tmp_path / "run", resume=True)), whole)
 
 
-@pytest.mark.parametrize("number", [pytest.param(1, marks=SLOW), 5])
+@pytest.mark.parametrize("number", [5, *slow([1])])
 def test_a_run_stopped_before_its_first_update_continues_its_collection(
     tmp_path, undisturbed, number
 ):

@@ -4,33 +4,36 @@ import json
 import os
 import random
 import signal
-import subprocess
-import sys
 import time
 from types import SimpleNamespace
 
 import pytest
 
+from tests.fresh import start_script
 from tests.training.test_interruption import SAC, assert_same, config_for, outcome
 
 KILLS = 10
 SETTINGS = {**SAC, "parallel": True, "start_method": "fork", "save_minutes": 0.01}
 
 
+CODE = """
+import os, sys
+os.setsid()
+sys.stdin = open("config.json")
+from ba_torchrl.training.grid.run_one import main
+main()
+"""
+
+
 def start(folder, **changes):
-    """Start a training process, which leads a group of its own."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "ba_torchrl.training.grid.run_one"],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-    )
-    with process.stdin as stdin:
-        stdin.write(json.dumps({**SETTINGS, **changes, "run_dir": str(folder), "resume": True}))
-    return process
+    """Start the process of a run, which leads a group of its own; its files are beside the run."""
+    values = {**SETTINGS, **changes, "run_dir": str(folder), "resume": True}
+    (folder.parent / "config.json").write_text(json.dumps(values))
+    return start_script(folder.parent, CODE)
+
+
+def messages(folder):
+    return (folder.parent / "stderr").read_text()
 
 
 def newest_state(folder):
@@ -41,7 +44,7 @@ def newest_state(folder):
 def wait_for(condition, process):
     deadline = time.monotonic() + 60
     while not condition():
-        assert process.poll() is None, process.stderr.read()[-2000:]
+        assert process.exitcode is None
         assert time.monotonic() < deadline
         time.sleep(0.02)
 
@@ -51,7 +54,8 @@ def finish(folder, **changes):
     from ba_torchrl.training.checkpoint import load
 
     process = start(folder, **changes)
-    assert process.wait(300) == 0, process.stderr.read()[-2000:]
+    process.join(300)
+    assert process.exitcode == 0, messages(folder)[-2000:]
     _, algorithm = load(folder, "latest")
     config = config_for(folder, {**SETTINGS, **changes})
     return outcome(SimpleNamespace(config=config, algorithm=algorithm))
@@ -59,11 +63,13 @@ def finish(folder, **changes):
 
 def test_a_signal_to_the_whole_group_saves_the_run(tmp_path):
     """Schedulers and terminals signal the workers, too."""
-    process = start(tmp_path)
-    wait_for(lambda: newest_state(tmp_path), process)
+    folder = tmp_path / "run"
+    process = start(folder)
+    wait_for(lambda: newest_state(folder), process)
     os.killpg(process.pid, signal.SIGTERM)
-    assert process.wait(60) == 128 + signal.SIGTERM
-    lines = process.stderr.read().splitlines()
+    process.join(60)
+    assert process.exitcode == 128 + signal.SIGTERM
+    lines = messages(folder).splitlines()
     assert "stopped by SIGTERM, state saved" in lines[-1]
     assert not any("replaced" in line for line in lines)
 
@@ -82,9 +88,9 @@ def test_a_run_killed_at_random_moments_ends_with_the_same_bits(tmp_path):
             time.sleep(generator.uniform(0, 2))
         else:
             time.sleep(generator.uniform(0, 6))
-        assert process.poll() is None, "the run ended too early to be killed"
+        assert process.exitcode is None, "the run ended too early to be killed"
         process.kill()
-        process.wait()
+        process.join()
         reached.add(newest_state(folder))
     assert len(reached) >= KILLS // 2, reached
     assert_same(finish(folder, **values), finish(tmp_path / "whole", **values))

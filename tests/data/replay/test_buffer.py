@@ -19,6 +19,7 @@ from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.data.replay.storage import FrameTable
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
+from tests.specs import slow_except
 
 QUANTIZER = DepthQuantizer(0.32)
 
@@ -196,7 +197,13 @@ def test_incompressible_images_fit_as_well():
         assert rb.storage.nbytes / len(rb) <= limit
 
 
-@pytest.mark.parametrize("task", [t for t in ba_torchrl.list_tasks() if t.startswith("close_loop")])
+@pytest.mark.parametrize(
+    "task",
+    slow_except(
+        [task for task in ba_torchrl.list_tasks() if task.startswith("close_loop")],
+        ["close_loop/block_stacking", "close_loop/drawer_opening"],
+    ),
+)
 def test_memory_of_expert_episodes(task):
     """100,000 transitions of 128 px take 0.5 GB at most, also with short episodes."""
     env = ba_torchrl.make_vector_env(task, 1, parallel=False, seed=0, expert=True)

@@ -24,6 +24,7 @@ from tests.training.collectors.runs import (
 )
 
 KINDS = ("multi_sync", "multi_async")
+SLOW = pytest.mark.slow
 
 
 @pytest.fixture
@@ -126,7 +127,7 @@ def test_ended_workers_are_replaced_with_the_present_weights(kind, collecting):
     assert not (new[0][keys.DEPTH][:, None] == first[None]).flatten(2).all(2).any()
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["multi_sync", pytest.param("multi_async", marks=SLOW)])
 def test_workers_that_hang_are_replaced_after_the_timeout(kind, collecting):
     collection, _ = collecting(kind, timeout_s=2.0)
     for _ in range(3):
@@ -141,7 +142,7 @@ def test_workers_that_hang_are_replaced_after_the_timeout(kind, collecting):
     assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", ["multi_async", pytest.param("multi_sync", marks=SLOW)])
 def test_an_error_of_a_task_is_raised_and_workers_do_not_restart(
     kind, collecting, monkeypatch, tmp_path
 ):
