@@ -145,11 +145,7 @@ class RandomActions:
         self._generator = seeded_generator(seed)
 
     def __call__(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write the action and ``is_expert`` of every environment.
-
-        Args:
-            tensordict: with the expert's actions [N, A].
-        """
+        """Write the action and ``is_expert`` of every environment."""
         action = tensordict[keys.ACTION]
         low, high = self._space.low, self._space.high
         drawn = low + (high - low) * self._draw(*action.shape)
@@ -167,13 +163,7 @@ class RandomActions:
 
 
 def check_noise(noise: float, source: Source, name: str) -> None:
-    """Check the probability of random actions in demonstrations.
-
-    Args:
-        noise: the probability.
-        source: of the demonstrations.
-        name: of the setting, for error messages.
-    """
+    """Check that a probability of random actions is in [0, 1), and 0 without an expert."""
     if isinstance(noise, bool) or not isinstance(noise, int | float) or not 0 <= noise < 1:
         raise ConfigError(f"{name}: must be at least 0 and less than 1, got {noise!r}")
     if noise and source != "expert":
@@ -181,14 +171,7 @@ def check_noise(noise: float, source: Source, name: str) -> None:
 
 
 def check_turn_noise(noise: float, source: Source, turns: Sequence[int], name: str) -> None:
-    """Check the probability of random turns in demonstrations.
-
-    Args:
-        noise: the probability.
-        source: of the demonstrations.
-        turns: indices of the components that turn the gripper.
-        name: of the setting, for error messages.
-    """
+    """Check a probability of random turns, indices of which must be among the components."""
     check_noise(noise, source, name)
     if noise and not turns:
         raise ConfigError(f"{name}: the actions have no turns; leave it at 0")
@@ -222,12 +205,8 @@ def expert_scores(
     """Play episodes with a task's expert and return its results.
 
     Args:
-        task: id of the task.
-        episodes: number of episodes.
         seed: of the first episodes; environment i starts from ``seed + i``.
-        num_envs: number of environments.
         parallel: one process per environment; see `ba_torchrl.make_vector_env`.
-        env: fields of `EnvConfig`.
     """
     envs = make_vector_env(
         task, num_envs, parallel=parallel, **{**env, "seed": seed, "expert": True}

@@ -178,11 +178,7 @@ def check_demonstrations(
     """Check that there are demonstrations of the same task and parameters at ``path``.
 
     Args:
-        path: as for `load_demonstrations`.
-        task: id of the task.
-        env: fields of `EnvConfig` of the environments.
         least: number of episodes that are needed.
-        mapping: as for `load_demonstrations`.
     """
     path = Path(path)
     if _is_own(path, mapping):
@@ -198,12 +194,7 @@ def check_demonstrations(
 def recorded_expert(
     path: str | Path, mapping: str | Path | Mapping[str, Any] | None = None
 ) -> int | None:
-    """Return the version of the expert of the demonstrations at ``path``; None if it is not known.
-
-    Args:
-        path: as for `load_demonstrations`.
-        mapping: as for `load_demonstrations`.
-    """
+    """Return the version of the expert of demonstrations; None if it is not known."""
     path = Path(path)
     if not _is_own(path, mapping):
         return None

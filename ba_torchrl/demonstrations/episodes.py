@@ -23,6 +23,9 @@ RESULT_KEYS = (keys.REWARD, keys.SUCCESS, keys.FAULT, keys.TERMINATED, keys.TRUN
 """Entries of a step that hold the result of an episode."""
 LEAST_KEPT = 0.1
 """Least fraction of the episodes that must be kept."""
+MAX_LOST = 100
+"""Largest number of episodes that may be lost to faults, and the number of dropped ones from which
+`LEAST_KEPT` applies."""
 
 FAULTY_ATTEMPTS = 3
 """Attempts at an episode of a given seed until a fault is a failure."""
@@ -43,7 +46,6 @@ def collect_episodes(
     results_only: bool = False,
     on_episode: Callable[[TensorDict], None] | None = None,
     keep: Callable[[TensorDict], bool] | None = None,
-    max_lost: int = 100,
 ) -> list[TensorDict]:
     """Play complete episodes, a fixed number in each environment.
 
@@ -58,15 +60,13 @@ def collect_episodes(
         results_only: keep only the actions and the entries of `RESULT_KEYS`.
         on_episode: called with each episode when it ends, for progress bars.
         keep: whether an episode counts; None if all do.
-        max_lost: largest number of episodes that may be lost to faults, and the number of dropped
-            ones from which `LEAST_KEPT` applies.
 
     Returns:
         Episodes as TensorDicts [T], in the order of the environments.
 
     Raises:
         ConfigError: a trained policy is for another environment, or too few episodes are kept.
-        RuntimeError: more than ``max_lost`` episodes were lost to faults.
+        RuntimeError: more than `MAX_LOST` episodes were lost to faults.
     """
     check_policy(policy, env)
     (num_envs,) = env.batch_size
@@ -90,7 +90,7 @@ def collect_episodes(
             if following[keys.FAULT]:
                 lost += 1
                 logger.warning("an episode of environment %d was lost to a fault", i)
-                if lost > max_lost:
+                if lost > MAX_LOST:
                     raise RuntimeError(f"{lost} episodes were lost to faults; see the log")
                 continue
             episode = torch.stack(steps)
@@ -101,7 +101,7 @@ def collect_episodes(
                 continue
             dropped += 1
             kept = sum(map(len, finished))
-            if dropped >= max_lost and kept < LEAST_KEPT * (kept + dropped):
+            if dropped >= MAX_LOST and kept < LEAST_KEPT * (kept + dropped):
                 raise ConfigError(
                     f"only {kept} of {kept + dropped} episodes succeed, {episodes} are needed; "
                     "take failed ones too, less noise or another source"

@@ -191,14 +191,7 @@ def count_demonstrations(
     env: dict[str, Any],
     mapping: str | Path | Mapping[str, Any] | None,
 ) -> int:
-    """Return the number of episodes of a file, after the checks that need no values.
-
-    Args:
-        path: this and the others as for `import_demonstrations`.
-        task: id of the task.
-        env: fields of `EnvConfig`.
-        mapping: of the entries of somebody else's file.
-    """
+    """Return the number of episodes of a file, after the checks that need no values."""
     form = _format(path)
     if mapping is None:
         return len(_exported(form, path, task, env)[1])
@@ -329,9 +322,6 @@ def check_same_environment(
     Another version of the expert is a warning, once.
 
     Args:
-        path: of the demonstrations, for messages.
-        task: id of the task of the run.
-        env: fields of `EnvConfig` of the run.
         metadata: of the demonstrations: task, versions, source and env.
     """
     versions = versions_of(task)

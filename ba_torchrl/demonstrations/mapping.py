@@ -107,9 +107,6 @@ class MappedFile:
     """A file of somebody else, whose mapped entries get the types and shapes of an environment.
 
     Args:
-        form: of the file.
-        path: of the file.
-        resolved: the environment.
         mapping: of the entries, see `import_demonstrations`.
     """
 
@@ -182,7 +179,6 @@ class MappedFile:
         """Return the mapped entries of an episode with the types and shapes of the environment.
 
         Args:
-            stored: entries of the file.
             reads: False to check shapes only; the returned arrays have no rows.
         """
         arrays, rows = {}, {}

@@ -170,10 +170,7 @@ def record_demonstrations(
     ``env.reset(seed=seed + i)`` does; one that is not kept begins again.
 
     Args:
-        env: of a close-loop task.
         events: returns the flags of the keys' events, by code.
-        episodes: their number.
-        seed: of the first.
         only_successful: keep only episodes that reach the goal.
         show: called with the state of the episode as text.
 

@@ -109,7 +109,6 @@ def make_deconstruction_env(task: str, **config: Any) -> DeconstructionEnv:
 
     Args:
         task: id of an open-loop task with a structure.
-        config: fields of `EnvConfig`.
     """
     check_has_structure(task)
     return DeconstructionEnv(resolve_env(task, config))
@@ -136,9 +135,6 @@ def reverse_episode(episode: TensorDictBase) -> TensorDict:
     It has the entries of an expert's episode. Observations are in reverse order, actions are the
     inverse actions, and in-hand images are those of the inverse picks. The last step completes the
     structure, has the reward and terminates.
-
-    Args:
-        episode: steps [T] of a `DeconstructionEnv`.
     """
     if not is_reversible(episode):
         raise ValueError("the episode cannot be reversed: an action moved no object, or several")
@@ -187,14 +183,7 @@ class ReplayScores(NamedTuple):
 
 
 def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> ReplayScores:
-    """Play deconstruction episodes, each followed by its inverse actions from its last state.
-
-    Args:
-        task: id of a task with a structure.
-        episodes: number of deconstruction episodes.
-        seed: of the first episode.
-        config: other fields of `EnvConfig`.
-    """
+    """Play deconstruction episodes, each followed by its inverse actions from its last state."""
     env = make_deconstruction_env(task, **{**config, "seed": seed, "expert": True})
     lengths, reached = [], 0
     try:

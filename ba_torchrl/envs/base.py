@@ -225,8 +225,6 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         They have no effect on the simulation. The first call follows `reset`, the others each step.
 
         Args:
-            width: number of columns.
-            height: number of rows.
             at_contact: the call is that of `on_contact`.
         """
         yield self.render(width, height)
@@ -523,12 +521,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         )
 
     def _dense_reward(self, progress_before: float, sparse: float) -> float:
-        """Return the reward of the last step; see `EnvConfig.reward`.
-
-        Args:
-            progress_before: the step.
-            sparse: its sparse reward.
-        """
+        """Return the reward of the last step; see `EnvConfig.reward`."""
         if self.config.reward == "dense":
             return sparse or self._progress
         progress = 0.0 if self._ends[keys.TERMINATED] else self._progress

@@ -36,7 +36,6 @@ def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: s
 
     Args:
         action: [A] float32; values beyond its bounds are allowed, the environment clips them.
-        task_id: for the message.
         action_sequence: one letter per component.
     """
     size = len(action_sequence)

@@ -118,11 +118,7 @@ def _span(limits: tuple[float, float]) -> str:
 
 
 def describe(task: str) -> TaskDescription:
-    """Return the description of a task, with its default parameters.
-
-    Args:
-        task: one of `ba_torchrl.list_tasks`.
-    """
+    """Return the description of a task, with its default parameters."""
     from ba_torchrl.envs.factory import make  # imports torch
 
     cls = TASKS[task]

@@ -107,7 +107,6 @@ class Episodes:
         """Start an episode; a task that continues keeps the objects of the previous one.
 
         Args:
-            rng: draws the scale and the initial poses.
             with_new_objects: place new objects even if the task continues.
         """
         scene = self.scene

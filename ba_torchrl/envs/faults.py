@@ -31,7 +31,6 @@ def check_bodies(scene: Scene, *, may_be_lost: bool = False) -> None:
     """Check that the state of a scene is one that the physics engine can continue from.
 
     Args:
-        scene: the scene.
         may_be_lost: check only that poses and joint angles are finite.
 
     Raises:
@@ -64,11 +63,7 @@ def check_observation(observation: Mapping[str, torch.Tensor | NonTensorData]) -
 
 
 class FaultCounter:
-    """Counts the faults of an environment, and ends it after too many in a row.
-
-    Args:
-        task_id: for messages.
-    """
+    """Counts the faults of an environment, and ends it after too many in a row."""
 
     def __init__(self, task_id: str) -> None:
         self._task_id = task_id

@@ -34,12 +34,7 @@ OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.
 
 
 class Observation(ABC):
-    """Entries that are added to every observation.
-
-    Args:
-        config: the environment's parameters.
-        workspace: bounds of the task.
-    """
+    """Entries that are added to every observation."""
 
     parameter: ClassVar[str | None] = None
     """Field of `EnvConfig` that enables the observation, in addition to `observations`."""

@@ -219,9 +219,6 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
         """Return the target of the tool; the heightmap gives its height if the action has no z.
 
         Args:
-            scene: the scene.
-            command: the action.
-            primitive: `PICK` or `PLACE`.
             heights: the heightmap; None means that it is rendered if it is needed.
         """
         if command.z_m is not None:

@@ -86,11 +86,9 @@ def scene_viewpoint(
     It depends on nothing that moves, so that all images of an episode have the same.
 
     Args:
-        world: the scene.
         terrain: of the task; its bodies are shown in the workspace only.
         arm_m: a point of the arm or several, [3] or [N, 3], which the image shows as well.
         aspect: width of the image divided by its height.
-        direction: of the camera.
     """
     workspace = terrain.workspace
     low, high = np.transpose([workspace.x, workspace.y])
@@ -108,11 +106,7 @@ def scene_viewpoint(
 
 
 class ArmDisplay:
-    """A second world with the bodies of a scene, for images with the arm in another pose.
-
-    Args:
-        build: builds the scene for objects of a scale.
-    """
+    """A second world with the bodies of a scene, for images with the arm in another pose."""
 
     def __init__(self, build: Callable[[float], Scene]) -> None:
         self._build = build
@@ -126,12 +120,6 @@ class ArmDisplay:
         """Return a world that equals a scene, with the arm and the held body at a pose.
 
         The arm keeps its pose if the other one is out of reach.
-
-        Args:
-            scene: an open-loop scene.
-            scale: of its objects.
-            position: of the tool, metres.
-            rotation: of the tool.
         """
         if scale != self._scale:
             self.close()
@@ -235,7 +223,6 @@ def copy_poses(source: World, target: World) -> None:
     """Copy the poses and joint positions of all bodies, robot included, to a world of the same.
 
     Args:
-        source: is not changed.
         target: has the same bodies, loaded in the same order.
     """
     here, there = {"physicsClientId": source.client}, {"physicsClientId": target.client}

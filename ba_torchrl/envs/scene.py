@@ -99,12 +99,7 @@ def build_scene(
     """Build the world of a task for objects of one scale.
 
     Args:
-        task_class: of the task.
-        settings: of the task.
-        config: the environment's parameters.
         physics: settings of the engine, which the configuration can override.
-        make_controller: builds the controller of a robot and a task.
-        window: show the world in PyBullet's window.
     """
     world = _empty_world(config, settings.workspace, physics, window)
     terrain = Tray(world, settings.workspace) if config.close_loop_tray else None

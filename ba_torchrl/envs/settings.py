@@ -78,12 +78,7 @@ class ResolvedEnv:
         return Workspace(*self.config.workspace)
 
     def task_settings(self, scale: float, limits: ActionLimits) -> TaskSettings:
-        """Return the settings of the task for objects of one scale.
-
-        Args:
-            scale: of the objects.
-            limits: of one action.
-        """
+        """Return the settings of the task for objects of one scale."""
         config, model = self.config, self.task_class.Parameters
         return TaskSettings(
             workspace=self.workspace,
@@ -96,11 +91,7 @@ class ResolvedEnv:
         )
 
     def changed(self, **changes: Any) -> ResolvedEnv:
-        """Return the parameters with changes, resolved anew.
-
-        Args:
-            changes: fields of `EnvConfig`.
-        """
+        """Return the parameters with changes, resolved anew."""
         return resolve_env(self, changes)
 
     def check_spawned_process_knows(self) -> None:

@@ -88,7 +88,6 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     Args:
         precision: "auto" is bfloat16 if the hardware multiplies it faster than float32, else
             float32.
-        device: device of the input.
     """
     if precision == "auto":
         return torch.bfloat16 if _bfloat16_is_fast(device.type) else torch.float32

@@ -50,7 +50,6 @@ def play_expert(env: BulletArmEnv, episodes: int, *, noise: float = 0.0) -> list
 
     Args:
         env: with ``expert=True``.
-        episodes: how many.
         noise: standard deviation of the Gaussian noise of its actions, as a share of the range of
             each component.
     """

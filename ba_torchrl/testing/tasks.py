@@ -91,8 +91,6 @@ def check_task(
     An expert whose success depends on exact actions passes, with a warning.
 
     Args:
-        task: id of a registered task.
-        robot: name of the robot.
         episodes: number of episodes that the expert plays, both from the start and after random
             actions.
         min_success_rate: of the expert from the start.

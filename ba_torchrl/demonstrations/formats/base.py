@@ -250,14 +250,7 @@ def find_format(path: Path) -> Format | None:
 
 
 def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
-    """Write episodes with their card; they appear under their name when all is on the disk.
-
-    Args:
-        form: of the file.
-        path: new file or folder.
-        episodes: their entries by key.
-        card: of the episodes.
-    """
+    """Write episodes with their card; they appear under their name when all is on the disk."""
     import torch
 
     named = []

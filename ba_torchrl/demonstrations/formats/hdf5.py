@@ -104,8 +104,6 @@ def _datasets(h5py: Any, group: Any, above: tuple[Any, ...] = ()) -> Iterator[tu
     """Yield the datasets below a group by their paths, links of any kind included.
 
     Args:
-        h5py: the library.
-        group: in which they are.
         above: the groups around it, which a link may name again.
     """
     above = (*above, group)

@@ -107,9 +107,7 @@ def _arrays(root: Any, files: Any, place: str) -> Iterator[tuple[str, Any]]:
     """Yield the arrays below a group, by their paths from there; those unknown as an exception.
 
     Args:
-        root: group of the file.
         files: path of the folder, or of the root of the archive.
-        place: path of the group.
     """
     for name in sorted(file.name for file in (files / place).iterdir() if file.is_dir()):
         try:

@@ -27,7 +27,6 @@ class Vector(ChecksPolicy, EnvBase):
     ``vector.render()`` a list of results.
 
     Args:
-        num_workers: number of environments.
         create_env_fn: builds one environment, or one such function per environment.
     """
 
@@ -84,13 +83,7 @@ class Vector(ChecksPolicy, EnvBase):
     def _call_each(
         self, method: str, arguments: Iterable[tuple[Any, ...]], **keywords: Any
     ) -> list[Any]:
-        """Call a method of each environment and return the results.
-
-        Args:
-            method: name of the method.
-            arguments: of each call.
-            keywords: of all calls.
-        """
+        """Call a method of each environment and return the results."""
 
     @abstractmethod
     def _get_each(self, name: str) -> tuple[list[Any], bool]:

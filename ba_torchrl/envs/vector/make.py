@@ -21,11 +21,7 @@ as one process on two cores (docs/performance.md, throughput)."""
 
 
 def processes_save_time(num_envs: int) -> bool:
-    """Return whether one process per environment is expected to step faster than one process.
-
-    Args:
-        num_envs: number of environments.
-    """
+    """Return whether one process per environment is expected to step faster than one process."""
     return min(num_envs, available_cores()) >= MIN_CONCURRENT_PROCESSES
 
 

@@ -57,8 +57,6 @@ class VectorEnv(Vector):
     waits.
 
     Args:
-        num_workers: number of environments.
-        create_env_fn: builds one environment, or one such function per environment.
         workers: how processes start and when they are replaced.
     """
 

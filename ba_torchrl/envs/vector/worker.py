@@ -78,9 +78,6 @@ def is_of_code(error: Exception) -> bool:
     """Return whether an error would occur again in a new process.
 
     Those of the simulator and of the machine's memory may not.
-
-    Args:
-        error: of an environment.
     """
     return not isinstance(error, (*SIMULATOR_ERRORS, WorkerError, MemoryError))
 
@@ -92,7 +89,6 @@ class Worker:
     one answer. Observations, rewards and flags are in shared memory.
 
     Args:
-        make_env: builds the environment.
         slot: TensorDicts in shared memory: action and state; observation, reward and flags.
         options: how the process starts, and its time limits.
     """
@@ -209,12 +205,7 @@ class Worker:
 
 
 class _Member:
-    """The environment of a worker process. Its methods are the commands.
-
-    Args:
-        make_env: builds the environment.
-        slot: as for `Worker`.
-    """
+    """The environment of a worker process. Its methods are the commands."""
 
     def __init__(self, make_env: MakeEnv, slot: Slot) -> None:
         self._make_env = make_env
@@ -311,9 +302,6 @@ def start_process(process: BaseProcess) -> None:
     Linux kills a worker when the thread that started it ends (``PR_SET_PDEATHSIG``), which is the
     end of this process only for the main thread. On behalf of other threads, a thread that never
     ends starts the process.
-
-    Args:
-        process: not started yet.
     """
     if threading.current_thread() is threading.main_thread():
         process.start()

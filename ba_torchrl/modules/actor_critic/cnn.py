@@ -27,7 +27,6 @@ class PlainActor(nn.Module):
     """Gaussian policy: an image trunk, and one network each for mean and log-std.
 
     Args:
-        trunk: the image trunk.
         head: from its features to those of the policy.
         loc: from these to the mean, before the squashing.
         log_std: from these to the log standard deviation.

@@ -11,13 +11,7 @@ from torch import Tensor, nn
 
 
 class BatchedLinear(nn.Module):
-    """A linear layer per head, computed for all heads together.
-
-    Args:
-        heads: number of heads.
-        in_size: input size of a head.
-        out_size: output size of a head.
-    """
+    """A linear layer per head, computed for all heads together."""
 
     def __init__(self, heads: int, in_size: int, out_size: int) -> None:
         super().__init__()
@@ -35,10 +29,6 @@ class FieldNorm(nn.Module):
 
     Scale and shift are those of a field, so that a permutation of each field's components by a
     group element commutes with the normalisation.
-
-    Args:
-        heads: number of heads.
-        fields: number of fields of a head.
     """
 
     def __init__(self, heads: int, fields: int) -> None:
@@ -64,7 +54,6 @@ class EnsembleCritic(nn.Module):
 
     Args:
         first: linear map from [features, action] to heads * fields * group_order channels.
-        heads: number of critics.
         fields: fields of a head's first layer, and units of its second.
         group_order: components of a field.
         arrange: maps the action [..., A] to the order of components that ``first`` takes.
@@ -123,7 +112,6 @@ class StateValue(nn.Module):
     Args:
         encoder: from the observation to features [..., F].
         critic: from features and action to values [..., K].
-        action_size: number of action components.
     """
 
     def __init__(self, encoder: nn.Module, critic: nn.Module, action_size: int) -> None:

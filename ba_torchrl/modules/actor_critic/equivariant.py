@@ -43,10 +43,6 @@ class ActionFields:
 
     (x, y) is a vector and the other components are invariant, except for the yaw r, which a
     reflection reverses.
-
-    Args:
-        action_sequence: one letter per component.
-        has_reflections: whether the group contains reflections.
     """
 
     def __init__(self, action_sequence: str, *, has_reflections: bool = False) -> None:
@@ -95,10 +91,6 @@ class PoseFields:
 
     Its position relative to the centre of the scene and the direction in which the fingers close
     are vectors; height and opening are invariant.
-
-    Args:
-        spec: vectors of the observation, and the centre.
-        has_reflections: whether the group contains reflections.
     """
 
     def __init__(self, spec: ActorCriticSpec, *, has_reflections: bool = False) -> None:
@@ -130,12 +122,7 @@ class PoseFields:
 
 
 class EquivariantEncoder(nn.Module):
-    """An image trunk, with the fields of the gripper's pose appended to its features.
-
-    Args:
-        trunk: the image trunk.
-        pose: how the pose transforms.
-    """
+    """An image trunk, with the fields of the gripper's pose appended to its features."""
 
     def __init__(self, trunk: ImageTrunk, pose: PoseFields) -> None:
         super().__init__()
@@ -183,11 +170,7 @@ class EquivariantActor(nn.Module):
     """Gaussian policy with equivariant mean and invariant log-std, before the squashing.
 
     Args:
-        gspace: images and their symmetry group.
-        trunk: the image trunk.
         features: fields of the trunk and of the pose.
-        action: how the action transforms.
-        pose: how the gripper's pose transforms.
     """
 
     def __init__(
@@ -218,9 +201,7 @@ class EquivariantTwinCritic(nn.Module):
     """Two invariant value heads on shared features and the action.
 
     Args:
-        gspace: images and their symmetry group.
         features: fields of the features, first regular ones.
-        action: how the action transforms.
     """
 
     def __init__(self, gspace: GSpace2D, features: FieldTypes, action: ActionFields) -> None:

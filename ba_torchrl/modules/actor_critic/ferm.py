@@ -21,13 +21,7 @@ _HIDDEN = 1024
 
 
 class FERMEncoder(nn.Module):
-    """Normalised features of an image.
-
-    Args:
-        trunk: the image trunk.
-        width: size of the trunk's output.
-        features: size of the features.
-    """
+    """Normalised features of an image."""
 
     def __init__(self, trunk: ImageTrunk, width: int, features: int) -> None:
         super().__init__()

@@ -17,10 +17,6 @@ class UnitTanhNormal(TanhNormal):
 
     TorchRL's constructor compares the bounds as tensors on the device and reads the result on the
     host, which then waits for the device in every forward pass; this one knows the bounds.
-
-    Args:
-        loc: mean of the Gaussian variable, [..., A].
-        scale: its standard deviation, [..., A].
     """
 
     def __init__(self, loc: Tensor, scale: Tensor) -> None:
@@ -63,8 +59,6 @@ class BoundedScale(nn.Module):
 
     Args:
         actor: from the observation to (loc, scale), each [..., A].
-        low: least standard deviation.
-        high: greatest standard deviation.
     """
 
     def __init__(self, actor: nn.Module, low: float, high: float) -> None:
@@ -80,7 +74,7 @@ class BoundedScale(nn.Module):
 
 
 def truncated_gaussian_policy(
-    actor: nn.Module, in_keys: Sequence[str], *, std_min: float, std_max: float = 1.0
+    actor: nn.Module, in_keys: Sequence[str], *, std_min: float
 ) -> ProbabilisticActor:
     """Return the policy whose action is a Gaussian variable truncated to [-1, 1].
 
@@ -90,10 +84,9 @@ def truncated_gaussian_policy(
     Args:
         actor: from the observation to (loc, scale), each [..., A].
         in_keys: keys of the observation, in the order of the actor's arguments.
-        std_min: least standard deviation.
-        std_max: greatest standard deviation.
+        std_min: least standard deviation; the greatest is 1.
     """
-    bounded = BoundedScale(actor, std_min, std_max)
+    bounded = BoundedScale(actor, std_min, 1.0)
     return ProbabilisticActor(
         TensorDictModule(bounded, in_keys=list(in_keys), out_keys=["loc", "scale"]),
         in_keys=["loc", "scale"],

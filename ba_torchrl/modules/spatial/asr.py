@@ -124,15 +124,7 @@ _LARGEST_MAP = 8
 
 
 class PlainYawValues(nn.Module):
-    """Q values of yaws from a patch, the in-hand image and the scene feature map.
-
-    Args:
-        spec: shapes of the images.
-        config: width, precision, units.
-        num_yaws: number of yaws.
-        patch_size: rows and columns of the patch.
-        scene_channels: channels of the scene map.
-    """
+    """Q values of yaws from a patch, the in-hand image and the scene feature map."""
 
     def __init__(
         self,

@@ -82,8 +82,6 @@ class SceneVector(nn.Sequential):
         head: "pool" for the maximum and the mean of each channel, so that the vector does not
             change when the map rotates with the scene; "flatten" for the flattened map.
         channels: of the map, each invariant except for the positions.
-        image_size: rows and columns of the heightmap.
-        config: width of the layers.
     """
 
     def __init__(
@@ -112,11 +110,7 @@ class EquivariantYawValues(nn.Module):
     filter. The values are equivariant under rotations of the whole scene if these are invariant.
 
     Args:
-        gspace: images and their symmetry group.
         out_repr: how the values of the yaws transform.
-        spec: shapes of the images.
-        config: width, precision, units.
-        patch_size: rows and columns of the patch.
         make_scene: returns the layers from the scene feature map to a vector, with
             ``out_features``.
     """
@@ -204,9 +198,7 @@ class EquivariantASRConfig(ASRNetworkConfig):
         """Return the values of the pixels, and those of the yaws with their view.
 
         Args:
-            spec: images and actions.
             yaw_units: units of the inputs of the yaw values.
-            patch_size: rows and columns of the patch.
         """
         gspace = planar_rotations_and_flips(self.group_order)
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)

@@ -42,7 +42,6 @@ def equivariant_unet(gspace: GSpace2D, fields: Sequence[int]) -> UNet:
     """Return a UNet from one invariant channel to fields[0] regular fields.
 
     Args:
-        gspace: images and their symmetry group.
         fields: numbers of regular fields of the five scales, from fine to coarse.
     """
     f1, f2, f4, f8, f16 = fields
@@ -62,8 +61,6 @@ class _Head(nn.Module):
     would be initialised with negative output weights only, and no value would exceed its bias.
 
     Args:
-        gspace: images and their symmetry group.
-        fields: number of regular fields.
         out_repr: representation of the values; there is a hidden layer only for invariant values.
     """
 
@@ -90,11 +87,8 @@ class EquivariantPixelValues(nn.Module):
     """Q values of every pixel, equivariant; those of places also depend on the in-hand image.
 
     Args:
-        gspace: images and their symmetry group.
         out_repr: how the values of one pixel transform: the trivial representation for a single
             value, a representation on yaws for one value per yaw.
-        spec: shapes of the images.
-        config: width, precision, units.
     """
 
     def __init__(

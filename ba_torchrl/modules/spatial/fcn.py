@@ -28,7 +28,6 @@ class FCN(SpatialQNetwork):
 
     Args:
         values: (heightmap, in_hand, holding) -> (values [B, maps, H, W], bottleneck map).
-        image_size: rows and columns of the heightmap.
         num_yaws: number of yaws, with one map each; None for a single map without yaws.
     """
 

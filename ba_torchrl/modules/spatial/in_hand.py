@@ -15,8 +15,6 @@ class InHandMap(nn.Module):
     """A feature map of a small image: three unpadded 3x3 convolutions and a pool, 24 -> 8 pixels.
 
     Args:
-        channels: of the image.
-        size: of the image, pixels.
         width: factor on the layers' widths, 64, 128 and 256.
     """
 
@@ -43,8 +41,6 @@ class InHandVector(nn.Module):
     There are two pools for images of 24 pixels and three for 40 pixels.
 
     Args:
-        channels: of the image.
-        size: of the image, pixels.
         width: factor on the convolutions' widths, 32, 64, 128 and 256.
         out_features: width of the linear layer.
     """

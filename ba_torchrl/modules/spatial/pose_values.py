@@ -31,8 +31,6 @@ class SceneMapVector(nn.Module):
     """A vector of the scene feature map: a 3x3 convolution, a pool and two linear layers.
 
     Args:
-        channels: of the map.
-        image_size: rows and columns of the heightmap.
         config: widths of the layers, 128, 1024 and 512 in the reference's size.
         copies: number of copies of each channel that the convolution sees.
     """
@@ -69,11 +67,8 @@ class PoseValues(nn.Module):
     image and of the scene are computed once per sample.
 
     Args:
-        spec: shapes of the images.
-        config: width, precision, units.
         view_channels: 1 for heights, 3 for projections.
         values_per_view: values of each view and primitive.
-        patch_size: rows and columns of a view.
         scene: from the scene feature map to a vector, with ``out_features``.
     """
 
@@ -142,7 +137,6 @@ class FingerSymmetricValues(nn.Module):
 
     Args:
         values: of one order of the fingers.
-        in_hand: declaration of the in-hand image.
     """
 
     def __init__(self, values: PoseValues, in_hand: ImageSpec) -> None:

@@ -28,8 +28,6 @@ class RotFCN(SpatialQNetwork):
 
     Args:
         values: (heightmap, in_hand, holding) -> (values [n*B, 1, P, P], bottleneck map) of n views.
-        image_size: rows and columns of the heightmap.
-        num_yaws: number of yaws.
         half_rotation: whether the yaws span half a turn.
     """
 

@@ -89,8 +89,6 @@ class PlainPixelValues(nn.Module):
     """Q values of every pixel from a plain UNet on the heightmap and the in-hand image.
 
     Args:
-        spec: shapes of the images.
-        config: width, precision, units.
         maps: values per pixel and primitive.
     """
 

@@ -167,13 +167,7 @@ class HeightView:
 
 @dataclass(frozen=True)
 class UprightView:
-    """Projections at the chosen pixel and yaw: at the chosen z, or at every z if none is chosen.
-
-    Args:
-        grid: values of the components.
-        pixel_m: edge of a pixel.
-        size: rows and columns of the projections.
-    """
+    """Projections at the chosen pixel and yaw: at the chosen z, or at every z if none is chosen."""
 
     grid: PoseGrid
     pixel_m: float
@@ -198,8 +192,6 @@ class TiltedView:
 
     Args:
         grid: values of the components; a single rx of zero for views before rx is chosen.
-        pixel_m: edge of a pixel.
-        size: rows and columns of the projections.
     """
 
     grid: PoseGrid

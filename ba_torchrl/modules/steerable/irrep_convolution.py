@@ -74,12 +74,7 @@ class Layout:
         self.rows, self.width = (size + padding for size in shape[2:])
 
     def chunks(self, part: slice, out_fields: int) -> Iterator[Chunk]:
-        """Iterate over the images of a part; the next chunk uses the same memory.
-
-        Args:
-            part: images of the batch.
-            out_fields: number of output fields.
-        """
+        """Iterate over the images of a part; the next chunk uses the same memory."""
         rows_that_fit = CHUNK_BYTES // (4 * self.maps * self.fields * self.width)
         step, rows, tops = max(1, rows_that_fit // self.rows), self.rows, [0]
         groups = self.output[0] // max(LEAST_ROWS, rows_that_fit)
@@ -270,7 +265,6 @@ def irrep_kernels(
     """Return the kernels in the basis of irreps, None where that basis is not orthogonal.
 
     Args:
-        rep: the representation of input and output.
         kernels: [D, N, 3, 3, N], input channels last.
         in_irreps: for each of the D kernels, the input irrep that it reads.
     """
@@ -324,11 +318,8 @@ def saves_time(
     of a large convolution below, on a CPU with AVX-512 (docs/findings.md).
 
     Args:
-        kernels: the kernels.
         size: height and width of the images.
         in_fields, out_fields: number of fields.
-        padding: zeros on each side.
-        threads: number of torch's threads.
     """
     order = len(kernels.change)
     products = sum(block.size * block.maps for block in kernels.blocks) * in_fields * out_fields
@@ -347,7 +338,6 @@ def irrep_convolution(
 
     Args:
         x: regular fields, the channels of a field together.
-        kernels: the kernels in the basis of irreps.
         coefficients: [out, in, D], of the kernels.
         bias: [out * N].
         padding: zeros added on each side, pixels; at most 2.

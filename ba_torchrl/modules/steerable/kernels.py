@@ -62,12 +62,6 @@ def kernel_block(
     """Return the kernels between two representations, None if there are none.
 
     Built once per process: escnn's construction takes up to a second for large groups.
-
-    Args:
-        gspace: images and their symmetry group.
-        in_repr: representation of the input field.
-        out_repr: representation of the output field.
-        kernel_size: pixels.
     """
     nn = import_escnn("escnn.nn")
     types = nn.FieldType(gspace, [in_repr]), nn.FieldType(gspace, [out_repr])
@@ -109,8 +103,6 @@ def he_scales(
 
     Args:
         blocks: kernels of each pair (input type, output type) that has kernels.
-        in_types: input fields.
-        out_types: output fields.
     """
     sources: dict[tuple[int, int], set] = defaultdict(set)
     kernels: Counter = Counter()

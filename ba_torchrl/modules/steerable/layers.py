@@ -74,10 +74,6 @@ def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representati
     equivalent, the steps generate C_2count and half a turn leaves the values unchanged, which is
     the quotient representation C_2count / C_2. Otherwise it is the regular representation of
     C_count.
-
-    Args:
-        count: number of yaws, evenly spaced.
-        half_rotation: whether the yaws span half a turn.
     """
     if half_rotation:
         gspace = planar_rotations(2 * count)
@@ -94,13 +90,10 @@ class SteerableConv2d(nn.Module):
     symmetry.
 
     Args:
-        gspace: images and their symmetry group.
         in_types: input fields as (representation, multiplicity); each representation once.
         out_types: output fields likewise.
-        kernel_size: pixels.
         padding: zeros added on each side, pixels.
         stride: distance between output pixels, in input pixels.
-        bias: one bias per trivial irrep of the output.
     """
 
     def __init__(
@@ -112,7 +105,6 @@ class SteerableConv2d(nn.Module):
         *,
         padding: int = 0,
         stride: int = 1,
-        bias: bool = True,
     ) -> None:
         super().__init__()
         for types in (in_types, out_types):
@@ -155,7 +147,7 @@ class SteerableConv2d(nn.Module):
         expansion = bias_expansion(out_types)
         self._bias_block = KernelBlock(expansion.t().contiguous(), (), ())
         count = expansion.shape[1]
-        self.bias = nn.Parameter(torch.zeros(count)) if bias and count else None
+        self.bias = nn.Parameter(torch.zeros(count)) if count else None
 
     @staticmethod
     def _name(pair: tuple[int, int]) -> str:
@@ -249,10 +241,8 @@ class SteerableConv2d(nn.Module):
 class SteerableLinear(SteerableConv2d):
     """The steerable map between vectors of fields: a one-pixel `SteerableConv2d`."""
 
-    def __init__(
-        self, gspace: GSpace2D, in_types: FieldTypes, out_types: FieldTypes, *, bias: bool = True
-    ) -> None:
-        super().__init__(gspace, in_types, out_types, 1, bias=bias)
+    def __init__(self, gspace: GSpace2D, in_types: FieldTypes, out_types: FieldTypes) -> None:
+        super().__init__(gspace, in_types, out_types, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [..., out] of x [..., in]."""
@@ -270,7 +260,6 @@ class DynamicSteerableConv2d(nn.Module):
     followed by one bias for each trivial irrep of the output. The module has no parameters.
 
     Args:
-        gspace: images and their symmetry group.
         representation: of each input field and each output field.
         count: number of fields, in and out.
         kernel_size: pixels; the map keeps its size.
@@ -334,10 +323,6 @@ def filter_generator(features: int, convolution: DynamicSteerableConv2d) -> nn.L
     The layer's biases are He-initialised coefficients, so for zero features the convolution is an
     ordinary freshly initialised layer. For features of unit size, its weights add a term of the
     same standard deviation.
-
-    Args:
-        features: number of features.
-        convolution: the convolution that uses the coefficients.
     """
     layer = nn.Linear(features, convolution.num_coefficients)
     scales = convolution.scales()

@@ -33,7 +33,6 @@ def relu_of_max_pool(x: Tensor, negative_slope: float = 0.0) -> Tensor:
     second derivative.
 
     Args:
-        x: images.
         negative_slope: factor of negative values (a leaky ReLU), not negative.
     """
     if x.dim() == 4 and is_plain_float32(x) and min(x.shape[2:]) > 1:

@@ -30,9 +30,6 @@ _NAMES = ("lie_learn", "representations", "SO3", "wigner_d")
 def import_escnn(name: str = "escnn") -> ModuleType:
     """Import a module of escnn.
 
-    Args:
-        name: of the module.
-
     Raises:
         ImportError: escnn is not installed; the message names the fix.
     """

@@ -94,13 +94,11 @@ class CloseLoopController:
             simulating it.
     """
 
-    def __init__(
-        self, robot: Robot, *, teleport: bool = True, limits: MotionLimits | None = None
-    ) -> None:
+    def __init__(self, robot: Robot, *, teleport: bool = True) -> None:
         self.robot = robot
         self.world = robot.world
         self.teleport = teleport
-        self.limits = limits or MotionLimits()
+        self.limits = MotionLimits()
         self._target_opening = 1.0
         self._grasp: FirmGrasp | None = None
         """The grasp that a simulated motion has tested, until the body slips."""

@@ -153,7 +153,6 @@ class PickPlace:
         opening: float = 1.0,
         top_down: bool = False,
         surface: SupportSurface | None = None,
-        limits: PickPlaceLimits | None = None,
     ) -> None:
         self.robot = robot
         self.world = robot.world
@@ -161,7 +160,7 @@ class PickPlace:
         self.opening = opening
         self.top_down = top_down
         self.surface = surface or Floor(self.world.floor)
-        self.limits = limits or PickPlaceLimits()
+        self.limits = PickPlaceLimits()
         self.held: Body | None = None
         """The held body, which is hidden from cameras."""
         self.grasp: Pose | None = None

@@ -82,9 +82,6 @@ def wrist_lens(tool: Pose) -> Lens:
     """Return a camera on the gripper that looks along the fingers at the point between their tips.
 
     It is beside the hand, in the plane between the fingers; image columns follow the closing axis.
-
-    Args:
-        tool: pose of the tool frame.
     """
     eye = tool.compose(Pose(WRIST_EYE_M)).position
     down = tool.compose(Pose((0.0, 1.0, 0.0))).position
