@@ -18,7 +18,7 @@ from ba_torchrl.cli import PROGRAM
 from ba_torchrl.core.config import EnvConfig, env_config_model
 from ba_torchrl.demonstrations.formats.base import FORMATS
 from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.vision.views import VIEWS
+from ba_torchrl.sim.vision.camera_views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 

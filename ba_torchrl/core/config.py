@@ -209,7 +209,7 @@ class EnvConfig(StrictModel):
     close_loop_tray: bool = Field(default=False, json_schema_extra=_CLOSE_LOOP)
     """Close loop: the objects lie in a tray as in Object Grasping."""
     view_type: str = Field(default="camera_center_xyz", json_schema_extra=_CLOSE_LOOP)
-    """Close loop: view of the depth image; see `ba_torchrl.sim.vision.views`."""
+    """Close loop: view of the depth image; see `ba_torchrl.sim.vision.camera_views`."""
     view_scale: float = Field(default=1.5, gt=0, le=100, json_schema_extra=_CLOSE_LOOP)
     """Close loop: width of the image as a multiple of the workspace's width."""
     dpos: float = Field(default=0.05, gt=0, le=1, json_schema_extra=_CLOSE_LOOP)

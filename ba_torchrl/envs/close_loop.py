@@ -13,12 +13,12 @@ from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.core.config import EnvConfig
 from ba_torchrl.core.images import Frame, ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
-from ba_torchrl.envs.positions import RecordedPosition
+from ba_torchrl.envs.episode_positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.sim.vision.views import VIEWS, ViewInput, ViewSetup
+from ba_torchrl.sim.vision.camera_views import VIEWS, ViewInput, ViewSetup
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.workspace import ActionLimits
 
@@ -34,7 +34,7 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
     An action moves the tool by at most `dpos` along each axis and turns it by at most `drot`,
     then opens or closes the gripper. By default the image is the orthographic depth below a camera
     that moves with the tool and does not rotate with it. The fingers are drawn as squares of zero.
-    Other views are in `ba_torchrl.sim.vision.views`.
+    Other views are in `ba_torchrl.sim.vision.camera_views`.
     """
 
     default_action_sequence = "pxyzr"

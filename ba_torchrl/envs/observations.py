@@ -21,10 +21,10 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.envs.scene import Scene
+from ba_torchrl.sim.vision.camera_views import finger_boxes
 from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses, wrist_lens
 from ba_torchrl.sim.vision.rgb import RGBD_RANGE_M, render_owners, render_rgbd
-from ba_torchrl.sim.vision.views import finger_boxes
 from ba_torchrl.tasks.workspace import Workspace
 
 WRIST_RANGE_M = (0.02, 2.0)

@@ -17,8 +17,8 @@ from ba_torchrl.core.config import EnvConfig
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
+from ba_torchrl.envs.episode_positions import RecordedPosition
 from ba_torchrl.envs.episodes import SETTLE_STEPS
-from ba_torchrl.envs.positions import RecordedPosition
 from ba_torchrl.envs.rendering import ARM_VIEW, DISPLAY_POINT, DISPLAY_YAW_RAD, ArmDisplay
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv

@@ -18,7 +18,7 @@ from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
 from ba_torchrl.demonstrations.demo_files import load_demonstrations
 from ba_torchrl.demonstrations.episodes import is_success
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig
@@ -43,7 +43,7 @@ def start_collection(
     config: ExperimentConfig,
     algorithm: Learner,
     seed: int,
-    positions: Sequence[Position] | None,
+    positions: Sequence[EpisodePosition] | None,
 ) -> Collection:
     """Start the collector of a run.
 

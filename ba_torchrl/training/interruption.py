@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 from typing_extensions import Self
 
 from ba_torchrl.core.errors import SimulationError, WorkerError
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 
 logger = logging.getLogger(__name__)
 
@@ -89,7 +89,7 @@ class StopSignals:
         self._before = {}
 
 
-def positions_of(env: EnvBase) -> list[Position] | None:
+def positions_of(env: EnvBase) -> list[EpisodePosition] | None:
     """Return the positions of a run's environments, None if one has failed."""
     if env.is_closed:
         return None

@@ -22,7 +22,7 @@ from torchrl.checkpoint import CheckpointRotation, GlobalRNGState
 
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, CurvePoint, Phase, differences
 from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.checkpoint import read_config, read_versions, write_config
@@ -68,7 +68,7 @@ class Progress:
     """Updates after which the run was resumed."""
     pending_updates: int = 0
     """Updates still to be taken for the last step of collection."""
-    positions: list[Position] | None = None
+    positions: list[EpisodePosition] | None = None
     """Position of each environment in its episodes; None before the collection starts."""
 
     def state_dict(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from ba_torchrl.core.config import CUSTOM_PHYSICS, EnvConfig
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.sim.robots.base import ROBOTS
-from ba_torchrl.sim.vision.views import VIEWS
+from ba_torchrl.sim.vision.camera_views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from tests.specs import slow_except
 

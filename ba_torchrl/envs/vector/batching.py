@@ -14,7 +14,7 @@ from torchrl.envs import EnvBase
 from typing_extensions import Self
 
 from ba_torchrl.envs.checks import ChecksPolicy, check_actions
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 
 MakeEnv = Callable[[], EnvBase]
 
@@ -122,11 +122,11 @@ class Vector(ChecksPolicy, EnvBase):
         for index in range(self.num_workers):
             self._seed_one(index, int(seed) + index, True)
 
-    def get_positions(self) -> list[Position]:
+    def get_positions(self) -> list[EpisodePosition]:
         """Return the position of each environment in its episodes; see `RecordedPosition`."""
         return self._call_each("get_position", [()] * self.num_workers)
 
-    def continue_from(self, positions: Sequence[Position]) -> None:
+    def continue_from(self, positions: Sequence[EpisodePosition]) -> None:
         """Continue the episodes of `get_positions`; the next reset returns their observations.
 
         Args:

@@ -17,7 +17,7 @@ from torchrl.envs import EnvCreator
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError, WorkerError
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.envs.vector.batching import MakeEnv, Vector
 from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
 
@@ -114,13 +114,13 @@ class VectorEnv(Vector):
             raise
         self.is_closed = False
 
-    def continue_from(self, positions: Sequence[Position]) -> None:
+    def continue_from(self, positions: Sequence[EpisodePosition]) -> None:
         """Continue episodes; see `Vector.continue_from`."""
         steps = max(sum(map(len, position["actions"])) for position in positions)
         commands = [("call", ("continue_from", position), {}) for position in positions]
         self._ask_all(commands, self.workers.timeout_s + steps * _STEP_S)
 
-    def get_positions(self) -> list[Position]:
+    def get_positions(self) -> list[EpisodePosition]:
         """Return the position of each environment; see `Vector.get_positions`."""
         if self._lost:
             raise WorkerError(f"the episodes of environments {sorted(self._lost)} are lost")

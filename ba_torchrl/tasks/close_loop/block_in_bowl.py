@@ -15,7 +15,7 @@ from ba_torchrl.sim.shapes import Solid
 from ba_torchrl.tasks.base import BLUE, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import CLOSED, OPEN, grasped_body, move_toward
-from ba_torchrl.tasks.manipulation.progress import nearness, reach, share, staged
+from ba_torchrl.tasks.manipulation.progress_terms import nearness, reach, share, staged
 from ba_torchrl.tasks.manipulation.transport import pick_up, travel
 from ba_torchrl.tasks.workspace import Spacing, random_points
 

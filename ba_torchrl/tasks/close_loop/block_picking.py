@@ -13,7 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import grasp, grasped_body, lift
-from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
+from ba_torchrl.tasks.manipulation.progress_terms import lift_height, reach, staged
 
 
 @TASKS.register("close_loop/block_picking")

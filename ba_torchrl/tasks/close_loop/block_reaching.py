@@ -13,7 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import OPEN, grasp
-from ba_torchrl.tasks.manipulation.progress import reach, staged
+from ba_torchrl.tasks.manipulation.progress_terms import reach, staged
 
 
 @TASKS.register("close_loop/block_reaching")

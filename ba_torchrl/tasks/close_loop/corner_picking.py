@@ -26,7 +26,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
-from ba_torchrl.tasks.manipulation.progress import lift_height, nearness, reach, share, staged
+from ba_torchrl.tasks.manipulation.progress_terms import lift_height, nearness, reach, share, staged
 from ba_torchrl.tasks.manipulation.transport import pick_up
 
 WALL_COLOR: Color = (0.72, 0.7, 0.66, 1.0)

@@ -31,7 +31,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
-from ba_torchrl.tasks.manipulation.progress import nearness, share, staged, turn_m
+from ba_torchrl.tasks.manipulation.progress_terms import nearness, share, staged, turn_m
 from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS
 
 CABINET_M: Vector = (0.22, 0.23, 0.11)

@@ -27,7 +27,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     lift,
     move_toward,
 )
-from ba_torchrl.tasks.manipulation.progress import lift_height, reach, staged
+from ba_torchrl.tasks.manipulation.progress_terms import lift_height, reach, staged
 
 RISK_ALLOWED_WITHOUT_YAW = 1.0
 """Largest risk score of a grasp of a gripper that cannot turn and has few grasps; with only riskier

@@ -175,12 +175,12 @@ def tool_clearances_m(
     """
     # in frames at the tools' positions in which the tools point straight down at yaw zero
     upright = np.array(downward(0.0)).T
-    to_views = np.stack([rotation_array(tool.orientation) @ upright for tool in tools])
+    to_tools = np.stack([rotation_array(tool.orientation) @ upright for tool in tools])
     origins = np.array([tool.position for tool in tools])[:, None]
     parts, heights = _hand_extents(robot.gripper, robot.hand_half_extents_m, opening)
     gaps = np.full(len(tools), math.inf)
     for other in others:
-        corners = (world_vertices(other) - origins) @ to_views
+        corners = (world_vertices(other) - origins) @ to_tools
         separations = separation_m(parts[:, None], extents_m(corners[..., :2]))  # [parts, K]
         is_higher = corners[..., 2].max(axis=1) > heights[:, None]
         gaps = np.minimum(gaps, np.where(is_higher, separations, math.inf).min(axis=0))

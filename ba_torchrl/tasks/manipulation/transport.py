@@ -17,7 +17,7 @@ from ba_torchrl.tasks.manipulation.clearance import (
     grasp_clearance_m,
     tips_below_tool_m,
 )
-from ba_torchrl.tasks.manipulation.commands import carrying_pose
+from ba_torchrl.tasks.manipulation.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_RAD,
     CLOSED,

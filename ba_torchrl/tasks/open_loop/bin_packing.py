@@ -17,8 +17,8 @@ from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.commands import no_op, perturbed_pick, pick_command
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, narrowest, outline
+from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, perturbed_pick, pick_command
 from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 

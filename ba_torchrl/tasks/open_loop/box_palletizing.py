@@ -17,7 +17,9 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.commands import (
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.manipulation.pick_place_commands import (
     LEVEL_RAD,
     carrying_pose,
     no_op,
@@ -26,8 +28,6 @@ from ba_torchrl.tasks.manipulation.commands import (
     place_command,
     swaps_fingers,
 )
-from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.packing.base import (
     FILLING_ORDERS,
     RELEASE_GAP_M,

@@ -18,13 +18,13 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.body_pool import deactivate_body
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.commands import (
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
+from ba_torchrl.tasks.manipulation.pick_place_commands import (
     no_op,
     perturbed_pick,
     pick_command,
     place_command,
 )
-from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.manipulation.transport import RELEASE_GAP_M
 from ba_torchrl.tasks.terrain.flat import Terrain
 

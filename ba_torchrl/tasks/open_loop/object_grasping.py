@@ -13,8 +13,8 @@ from ba_torchrl.sim.geometry import downward_pose
 from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import DEEPEST_M, PIXEL_M, YAWS
-from ba_torchrl.tasks.manipulation.commands import pick_command
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
+from ba_torchrl.tasks.manipulation.pick_place_commands import pick_command
 
 OBJECT_WIDTH_M = 0.045
 """Assumed width of the object between the fingers, for picks without z."""

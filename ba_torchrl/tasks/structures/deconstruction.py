@@ -25,8 +25,8 @@ from ba_torchrl.sim.geometry import (
     tool_rotation,
 )
 from ba_torchrl.tasks.base import OpenLoopTask
-from ba_torchrl.tasks.manipulation.commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.manipulation.footprints import extents_m, separation_m
+from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.assignment import mean_position
 from ba_torchrl.tasks.structures.blueprint import Slot
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps

@@ -29,8 +29,8 @@ from ba_torchrl.tasks.manipulation.clearance import (
     path_clearance_m,
     tool_clearances_m,
 )
-from ba_torchrl.tasks.manipulation.commands import LEVEL_RAD
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.manipulation.pick_place_commands import LEVEL_RAD
 from ba_torchrl.tasks.structures.free_space import extent_along_m
 from ba_torchrl.tasks.structures.moves import DEFICIT_WEIGHT, Grasps
 from ba_torchrl.tasks.structures.structure import Structure

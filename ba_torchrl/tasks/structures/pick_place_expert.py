@@ -9,7 +9,8 @@ from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix, quaternion_yaw
-from ba_torchrl.tasks.manipulation.commands import (
+from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.manipulation.pick_place_commands import (
     carrying_pose,
     no_op,
     perturbed_pick,
@@ -17,7 +18,6 @@ from ba_torchrl.tasks.manipulation.commands import (
     place_command,
     swaps_fingers,
 )
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.grasps import SUFFICIENT_CLEARANCE_M, PickPlaceGrasps, Tilted
 from ba_torchrl.tasks.structures.moves import Move

@@ -6,7 +6,7 @@ import math
 
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.manipulation.progress import nearness, reach, staged
+from ba_torchrl.tasks.manipulation.progress_terms import nearness, reach, staged
 from ba_torchrl.tasks.structures.assignment import Assignment, SlotAssigner, mean_position
 from ba_torchrl.tasks.structures.structure import Structure
 

@@ -15,7 +15,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.config import StrictModel, WorkerOptions
 from ba_torchrl.core.registry import Registry
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Collection(ABC):
             RuntimeError: the environments or their workers failed too often in a row.
         """
 
-    def get_positions(self) -> list[Position] | None:
+    def get_positions(self) -> list[EpisodePosition] | None:
         """Return the position of each environment in its episodes; None if they are unknown."""
         return None
 
@@ -90,7 +90,9 @@ class CollectorConfig(StrictModel, ABC):
         return
 
     @abstractmethod
-    def start(self, problem: CollectionProblem, positions: Sequence[Position] | None) -> Collection:
+    def start(
+        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
+    ) -> Collection:
         """Start to collect.
 
         Args:

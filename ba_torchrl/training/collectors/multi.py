@@ -21,7 +21,7 @@ from torch import multiprocessing as mp
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.weight_update import MultiProcessWeightSyncScheme
 
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.envs.vector.worker import SentError, end_with, is_of_code
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
 from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig
@@ -37,7 +37,7 @@ class MultiSyncConfig(WorkersConfig):
     """The workers step at the same time, all with the weights of the latest update."""
 
     def start(
-        self, problem: CollectionProblem, positions: Sequence[Position] | None
+        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
     ) -> MultiCollection:
         """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
         frames = self.steps_per_batch * problem.num_envs
@@ -49,7 +49,7 @@ class MultiAsyncConfig(WorkersConfig):
     """The workers do not wait for each other, and step while the learner takes updates."""
 
     def start(
-        self, problem: CollectionProblem, positions: Sequence[Position] | None
+        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
     ) -> MultiCollection:
         """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
         frames = self.steps_per_batch * problem.num_envs // self.workers

@@ -16,7 +16,7 @@ from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
 from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig
 from ba_torchrl.training.ray_cluster import (
@@ -56,7 +56,7 @@ class RayConfig(WorkersConfig):
         check_installed("collector")
 
     def start(
-        self, problem: CollectionProblem, positions: Sequence[Position] | None
+        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
     ) -> RayCollection:
         """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
         return RayCollection(problem, self)

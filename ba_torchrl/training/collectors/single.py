@@ -10,7 +10,7 @@ from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 
 from ba_torchrl.core import keys
-from ba_torchrl.envs.positions import Position
+from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.collectors.base import (
     COLLECTORS,
     Collection,
@@ -25,7 +25,7 @@ class SingleConfig(CollectorConfig):
     """One step of all environments at a time, in the learner's process."""
 
     def start(
-        self, problem: CollectionProblem, positions: Sequence[Position] | None
+        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
     ) -> SingleCollection:
         """Start to collect; see `CollectorConfig.start`."""
         return SingleCollection(problem, positions)
@@ -39,7 +39,9 @@ class SingleCollection(Collection):
         positions: from which the environments continue; None to start new episodes.
     """
 
-    def __init__(self, problem: CollectionProblem, positions: Sequence[Position] | None) -> None:
+    def __init__(
+        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
+    ) -> None:
         super().__init__()
         generators = GlobalRNGState().state_dict()
         self.env = problem.make_env(problem.num_envs, problem.seed)
@@ -63,7 +65,7 @@ class SingleCollection(Collection):
         data = next(self._steps)
         return data.set(keys.ENV_INDEX, torch.arange(len(data), device="cpu"))
 
-    def get_positions(self) -> list[Position] | None:
+    def get_positions(self) -> list[EpisodePosition] | None:
         """Return the position of each environment; None if one has failed."""
         return positions_of(self.env)
 

@@ -16,7 +16,7 @@ from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.envs.episodes import EnvState
 from ba_torchrl.envs.settings import ResolvedEnv
 
-Position = dict[str, Any]
+EpisodePosition = dict[str, Any]
 """``seed``; ``episode``, the number of the first of some episodes; and ``actions``, float32
 [T, A], of each of them up to the present. They are the current episode and, where it continues with
 the objects of earlier episodes, these as well; none before the first episode and after a fault."""
@@ -39,7 +39,7 @@ class RecordedPosition:
     """Actions of each episode of the position; None if they do not determine the state."""
     _resumed: TensorDict | None = None
 
-    def get_position(self) -> Position:
+    def get_position(self) -> EpisodePosition:
         """Return the position.
 
         Raises:
@@ -62,7 +62,7 @@ class RecordedPosition:
             ],
         }
 
-    def continue_from(self, position: Position) -> None:
+    def continue_from(self, position: EpisodePosition) -> None:
         """Play the episodes of a position again; the next `reset` returns its observation.
 
         Args:
@@ -135,7 +135,7 @@ class RecordedPosition:
 def _make_copy(
     cls: type[EnvBase],
     resolved: ResolvedEnv,
-    start: Position | EnvState,
+    start: EpisodePosition | EnvState,
     attributes: dict[str, Any],
     device: torch.device | None,
 ) -> EnvBase:

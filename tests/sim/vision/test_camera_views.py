@@ -9,15 +9,15 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.errors import UnknownNameError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
-from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape
-from ba_torchrl.sim.vision.lens import oblique_lens
-from ba_torchrl.sim.vision.views import (
+from ba_torchrl.sim.vision.camera_views import (
     FINGER_SQUARE_HALF_M,
     MAX_RECESS_M,
     VIEWS,
     ViewInput,
     ViewSetup,
 )
+from ba_torchrl.sim.vision.depth import HeightCamera, PosedShape
+from ba_torchrl.sim.vision.lens import oblique_lens
 from ba_torchrl.sim.world import World
 
 SETUP = ViewSetup(
