@@ -88,10 +88,10 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
     def _make_controller(self, robot: Robot, task: Task) -> PickPlace:
         controller = PickPlace(
             robot,
+            task.terrain,
             teleport=self.config.fast_mode,
             opening=task.finger_opening,
             top_down=self.config.top_down_approach,
-            surface=task.terrain,
         )
         controller.on_contact = self._call_on_contact
         return controller

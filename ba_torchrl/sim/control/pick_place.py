@@ -55,28 +55,6 @@ class SupportSurface(Protocol):
         """
 
 
-@dataclass(frozen=True)
-class Floor:
-    """The horizontal floor at height zero."""
-
-    floor_id: int
-
-    @property
-    def support_ids(self) -> frozenset[int]:
-        """PyBullet id of the floor."""
-        return frozenset((self.floor_id,))
-
-    def lowest_tool_m(
-        self,
-        gripper: Gripper,
-        xy: tuple[float, float],
-        rotation: Matrix | None = None,
-        opening: float = 1.0,
-    ) -> float:
-        """Return the least height of the tool; see `SupportSurface`."""
-        return gripper.lowest_tool_m(rotation, opening)
-
-
 class HeldState(NamedTuple):
     """State of `PickPlace`."""
 
@@ -142,24 +120,23 @@ class PickPlace:
         teleport: teleport the arm, the fingers and the held body where they have no contacts.
         opening: of the fingers before a pick and after a place, 0 to 1.
         top_down: approach vertically even with a tilted tool, not along its z axis.
-        surface: support surface; None means the floor of the world.
     """
 
     def __init__(
         self,
         robot: Robot,
+        surface: SupportSurface,
         *,
         teleport: bool = True,
         opening: float = 1.0,
         top_down: bool = False,
-        surface: SupportSurface | None = None,
     ) -> None:
         self.robot = robot
         self.world = robot.world
         self.teleport = teleport
         self.opening = opening
         self.top_down = top_down
-        self.surface = surface or Floor(self.world.floor)
+        self.surface = surface
         self.limits = PickPlaceLimits()
         self.held: Body | None = None
         """The held body, which is hidden from cameras."""

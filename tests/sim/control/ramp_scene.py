@@ -12,6 +12,8 @@ from ba_torchrl.sim.geometry import Vector, rotation_array, tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
+from ba_torchrl.tasks.terrain.flat import Flat
+from ba_torchrl.tasks.workspace import Workspace
 
 CUBE_M = (0.03, 0.03, 0.03)
 LONG_M = (0.03, 0.12, 0.03)
@@ -43,7 +45,8 @@ class RampScene:
         self.slab.set_pose(SLAB_CENTER_M, self.turn)
         self.half_m = size_m[2] / 2
         self.world.seal()
-        self.hand = PickPlace(self.robot, teleport=teleport)
+        floor = Flat(self.world, Workspace((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25)))
+        self.hand = PickPlace(self.robot, floor, teleport=teleport)
         self.hand.reset()
         self.block.set_pose(self.above_slab(0.0), self.turn)
         self.world.settle()

@@ -13,6 +13,8 @@ from ba_torchrl.sim.geometry import tool_rotation
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import Physics, World
+from ba_torchrl.tasks.terrain.flat import Flat
+from ba_torchrl.tasks.workspace import Workspace
 from tests.specs import slow_except_two_robots
 
 B = 0.03
@@ -38,7 +40,8 @@ class Table:
         for i, block in enumerate(self.blocks):
             block.place((0.38 + 0.14 * (i // 2), -0.07 + 0.14 * (i % 2), B / 2))
         self.world.seal()
-        self.hand = PickPlace(self.robot, teleport=teleport, top_down=top_down)
+        floor = Flat(self.world, Workspace((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25)))
+        self.hand = PickPlace(self.robot, floor, teleport=teleport, top_down=top_down)
         self.hand.reset()
         self.world.settle()
 
