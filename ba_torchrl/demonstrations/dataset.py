@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -10,9 +10,6 @@ import torch
 from torchrl.collectors.utils import split_trajectories
 from torchrl.data import ImmutableDatasetWriter, TensorStorage
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
-from torchrl.data.replay_buffers.samplers import Sampler
-from torchrl.data.replay_buffers.writers import Writer
-from torchrl.envs import Transform
 
 from ba_torchrl.core.files import read_json
 from ba_torchrl.demonstrations.demo_files import METADATA_FILE, load_demonstrations
@@ -31,16 +28,10 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
         batch_size: of a sample; None if each call of ``sample`` passes it.
         root: folder of data sets, such as that of ``ba-torchrl collect source=graded``; by default
             the present one.
-        task: as for `load_demonstrations`.
-        env: as for `load_demonstrations`.
-        mapping: as for `load_demonstrations`.
+        task, env, mapping: as for `load_demonstrations`.
         split_trajs: items are episodes, padded to the longest, with ``mask``; else transitions.
-        sampler: of the draws; uniform by default.
-        writer: by default one that refuses to write.
-        collate_fn: as for `TensorDictReplayBuffer`.
-        pin_memory: as for `TensorDictReplayBuffer`.
-        prefetch: as for `TensorDictReplayBuffer`.
-        transform: of samples.
+        options: as for `TensorDictReplayBuffer`, such as ``sampler``, ``transform`` or ``prefetch``;
+            the writer refuses to write by default.
     """
 
     def __init__(
@@ -53,12 +44,7 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
         env: dict[str, Any] | None = None,
         mapping: str | Path | Mapping[str, Any] | None = None,
         split_trajs: bool = False,
-        sampler: Sampler | None = None,
-        writer: Writer | None = None,
-        collate_fn: Callable[..., Any] | None = None,
-        pin_memory: bool = False,
-        prefetch: int | None = None,
-        transform: Transform | None = None,
+        **options: Any,
     ) -> None:
         self.dataset_id, self.root = str(dataset_id), root or "."
         episodes = load_demonstrations(self.data_path, task=task, env=env, mapping=mapping)
@@ -70,16 +56,8 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
         steps = torch.cat(episodes)
         if split_trajs:
             steps = split_trajectories(steps, trajectory_key="episode")
-        super().__init__(
-            storage=TensorStorage(steps),
-            sampler=sampler,
-            writer=writer or ImmutableDatasetWriter(),
-            collate_fn=collate_fn,
-            pin_memory=pin_memory,
-            prefetch=prefetch,
-            transform=transform,
-            batch_size=batch_size,
-        )
+        options = {"writer": ImmutableDatasetWriter(), **options}
+        super().__init__(storage=TensorStorage(steps), batch_size=batch_size, **options)
 
     @staticmethod
     def available_datasets(root: str | Path = ".") -> list[str]:
