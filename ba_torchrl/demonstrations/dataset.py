@@ -30,8 +30,8 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
             the present one.
         task, env, mapping: as for `load_demonstrations`.
         split_trajs: items are episodes, padded to the longest, with ``mask``; else transitions.
-        options: as for `TensorDictReplayBuffer`, such as ``sampler``, ``transform`` or ``prefetch``;
-            the writer refuses to write by default.
+        options: as for `TensorDictReplayBuffer`, such as ``sampler`` or ``transform``; the writer
+            refuses to write by default.
     """
 
     def __init__(
