@@ -35,7 +35,7 @@ from ba_torchrl.algorithms.optimizers import LossFunction, Optimizers, Update
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.core.config import StrictModel, changed
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError, PartError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
@@ -220,17 +220,13 @@ class LearnerConfig(StrictModel, ABC):
         """
         if control not in self.controls:
             known = [name for name in ALGORITHMS if control in ALGORITHMS[name].controls]
-            raise ConfigError(
-                f"algorithm {ALGORITHMS.name_of(type(self))!r} learns "
-                f"{' and '.join(sorted(self.controls))} tasks, not {control} ones; {control} tasks "
-                f"take algorithm: {', '.join(known)}"
-            )
+            why = f"learns {' and '.join(sorted(self.controls))} tasks, not {control} ones"
+            name = ALGORITHMS.name_of(type(self))
+            raise PartError("algorithm", name, why, known, f"{control} tasks")
         if network.control != control:
             known = [name for name in NETWORKS if NETWORKS[name].control == control]
-            raise ConfigError(
-                f"network {NETWORKS.name_of(type(network))!r} is for {network.control} tasks; "
-                f"{control} tasks take network: {', '.join(known)}"
-            )
+            why, name = f"is for {network.control} tasks", NETWORKS.name_of(type(network))
+            raise PartError("network", name, why, known, f"{control} tasks")
 
     def without_effect(self, network: NetworkConfig) -> Iterator[str]:
         """Yield a message for each value that has no effect together with the others and the
@@ -356,7 +352,8 @@ class Learner(ABC):
         policy = self.trained_policy
         if not isinstance(policy, ProbabilisticTensorDictSequential):
             name = ALGORITHMS.name_of(type(self.config))
-            raise ConfigError(f"init: algorithm {name!r} has no actor for cloning to initialise")
+            why = "has no actor for cloning to initialise; leave out init"
+            raise PartError("algorithm", name, why)
         loss = BehaviourCloningLoss(policy, "kl", self.config.init_entropy_weight)
         loss.set_keys(action=keys.TARGET_ACTION)
         return loss

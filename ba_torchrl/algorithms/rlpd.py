@@ -18,7 +18,7 @@ from torch.optim.lr_scheduler import LinearLR
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Problem, SeedUse
 from ba_torchrl.algorithms.sac import SAC, SACConfig
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError, PartError
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec, NetworkConfig
@@ -86,7 +86,7 @@ class RLPD(SAC):
         networks = super().make_networks(network)
         if not isinstance(networks.critic, EnsembleCritic):
             name = NETWORKS.name_of(type(network))
-            raise ConfigError(f"network {name!r} builds no ensemble of critics; take another one")
+            raise PartError("network", name, "builds no ensemble of critics; take another one")
         return networks
 
     def make_loss(self, networks: ActorCritic) -> RLPDLoss:

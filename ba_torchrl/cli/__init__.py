@@ -15,7 +15,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ba_torchrl import __version__
-from ba_torchrl.core.errors import install_command, known_names
+from ba_torchrl.core.errors import UnknownNameError, install_command
 from ba_torchrl.core.malloc import tune_malloc
 
 PROGRAM = "ba-torchrl"
@@ -80,8 +80,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.stderr.write(f"error: {end}\n")
             sys.exit(EXIT_CODE)
     else:
-        end = known_names(first, command_names())
-        sys.stderr.write(f"error: unknown command {first!r}.{end}\n")
+        sys.stderr.write(f"error: {UnknownNameError('command', first, command_names())}\n")
         sys.exit(EXIT_CODE)
 
 

@@ -10,24 +10,23 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
-from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf, open_dict
+from omegaconf.errors import ConfigAttributeError, ConfigKeyError
 from pydantic import BaseModel
 
 from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import name_presets, plain_errors
 from ba_torchrl.cli.help import describe
 from ba_torchrl.core.config import parse
-from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import has_entry_points, load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.training import hydra_schema
@@ -97,26 +96,20 @@ class Command:
             return
         else:
             hydra_schema.register(arguments.overrides)
-        if arguments.is_for_hydra and not arguments.asks_for_help:
-            with self.composed(arguments):  # an unknown name ends it here
-                pass
-            self._run_in_hydra(words)
-            return
-        logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
-        with self.composed(arguments) as settings:
+        with self.composed(arguments) as settings:  # an unknown name ends it here
             if arguments.asks_for_help:
                 print(self._help(OmegaConf.to_container(settings), True))  # noqa: T201
-            else:
+            elif not arguments.is_for_hydra:
+                logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
                 self._run_composed(settings, arguments)
+        if arguments.is_for_hydra and not arguments.asks_for_help:
+            self._run_in_hydra(words)
 
     def _is_answered_early(self, arguments: Arguments) -> bool:
         """Refuse what is wrong, or print the help, without the import of torch, which takes
         seconds; return whether the command line is answered.
 
         Plugins and further folders can have other presets, so that the answer has to wait.
-
-        Raises:
-            ConfigError: a setting is wrong.
         """
         if arguments.config_dir or "plugins" in arguments.names or has_entry_points():
             return False
@@ -167,62 +160,43 @@ class Command:
         options = [word for word in rest if word.startswith("-")]
         given = {option.split("=")[0] for option in options}
         is_for_hydra = self.config is not None and bool(given & {*_OF_HYDRA})
-        known = ["--help", *(["--config-name", "--config-dir", *_OF_HYDRA] if self.config else [])]
-        if not is_for_hydra and options:
-            end = self._as_setting(options[0], words) or f".{known_names(options[0], known)}"
-            raise ConfigError(f"unknown option {options[0]!r}{end}")
+        if options and not is_for_hydra:
+            self._refuse(options[0], words)
         if self.config is None and (found.config_name or found.config_dir):
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
         if found.config_dir is not None and not Path(found.config_dir).is_dir():
             raise ConfigError(f"there is no folder {found.config_dir}")
-        if is_for_hydra:  # words without "=" are values of its options
-            overrides = [word for word in rest if word[:1] != "-" and ("=" in word or "~" in word)]
-        else:
-            overrides = list(self._overrides(rest))
-        return Arguments(
-            overrides,
-            found.config_name,
-            found.config_dir,
-            found.help,
-            is_for_hydra,
-        )
+        overrides = [word for word in rest if word[:1] != "-" and ("=" in word or word[:1] == "~")]
+        bare = [word for word in rest if word[:1] != "-" and word not in overrides]
+        if bare and not is_for_hydra:  # else they are values of its options
+            overrides.append(self._positional(bare, overrides))
+        return Arguments(overrides, found.config_name, found.config_dir, found.help, is_for_hydra)
 
-    def _as_setting(self, option: str, words: Sequence[str]) -> str:
-        """Return the end of a message on an option that is a setting; empty if it is none."""
+    def _refuse(self, option: str, words: Sequence[str]) -> NoReturn:
+        """Refuse an option; if it is the name of a setting, say how to write it."""
         name, _, value = option.lstrip("-").partition("=")
-        known = {*self.settings.model_fields}
+        name = name.replace("-", "_")
+        settings, known = {*self.settings.model_fields}, ["--help"]
         if self.config is not None:
             groups = (folder.name for folder in config_dir().iterdir() if folder.is_dir())
-            known |= {*ExperimentConfig.model_fields, *groups}
-        name = name.replace("-", "_")
-        if name.split(".")[0] not in known:
-            return ""
-        following = [*words[list(words).index(option) + 1 :], "VALUE"][0]
+            settings |= {*ExperimentConfig.model_fields, *groups}
+            known += ["--config-name", "--config-dir", *_OF_HYDRA]
+        if name.split(".")[0] not in settings:
+            raise UnknownNameError("option", option, known)
         if not value:
+            following = [*words[list(words).index(option) + 1 :], "-"][0]
             value = "VALUE" if following.startswith("-") or "=" in following else following
-        return f": write {shlex.join([f'{name}={value}'])}"
+        raise ConfigError(f"unknown option {option!r}: write {shlex.join([f'{name}={value}'])}")
 
-    def _overrides(self, words: Sequence[str]) -> Iterator[str]:
-        """Yield overrides; words without "=" set the positional field.
-
-        Raises:
-            ConfigError: the command has none, or it takes one word only.
-        """
-        bare = [word for word in words if "=" not in word and not word.startswith("~")]
-        yield from (word for word in words if word not in bare)
-        if not bare:
-            return
-        if any(word.startswith(f"{self.positional}=") for word in words):
-            raise ConfigError(f"{self.positional} is given twice")
+    def _positional(self, words: Sequence[str], overrides: Sequence[str]) -> str:
+        """Return the override of the positional field by words without "="."""
         if self.positional is None:
-            raise ConfigError(f"{bare[0]!r} sets nothing; settings are FIELD=VALUE, see --help")
-        quoted = ["'" + word.replace("'", "\\'") + "'" for word in bare]
-        if "list[" in str(self.settings.model_fields[self.positional].annotation):
-            yield f"{self.positional}=[{','.join(quoted)}]"
-        elif len(bare) == 1:
-            yield f"{self.positional}={quoted[0]}"
-        else:
-            raise ConfigError(f"one {self.positional} is expected, got {' '.join(bare)}")
+            raise ConfigError(f"{words[0]!r} sets nothing; settings are FIELD=VALUE, see --help")
+        if any(override.startswith(f"{self.positional}=") for override in overrides):
+            raise ConfigError(f"{self.positional} is given twice")
+        quoted = ["'" + word.replace("'", "\\'") + "'" for word in words]
+        value = quoted[0] if len(quoted) == 1 else f"[{','.join(quoted)}]"
+        return f"{self.positional}={value}"
 
     @contextmanager
     def composed(self, arguments: Arguments) -> Iterator[DictConfig]:
@@ -235,7 +209,7 @@ class Command:
         name = arguments.config_name or self.config or self._store_defaults()
         known = self.config_names(arguments.config_dir)
         if self.config is not None and name not in known:
-            raise ConfigError(f"unknown configuration {name!r}.{known_names(name, known)}")
+            raise UnknownNameError("configuration", name, known)
         if arguments.config_dir is not None:
             other = Path(arguments.config_dir).resolve()
             if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
@@ -247,7 +221,7 @@ class Command:
                     overrides = list(_first_of_sweeps(overrides))
                 settings = compose(name, overrides=overrides, return_hydra_config=True)
             except HydraException as error:
-                raise ConfigError(_explain(error, name, overrides)) from None
+                raise _explained(error) from None
             except ValueError as error:  # a preset that is neither a name nor a list
                 raise ConfigError(f"{error}; see --help") from None
             HydraConfig.instance().set_config(settings)
@@ -285,11 +259,11 @@ class Command:
         missing = sorted(name for name in settings if OmegaConf.is_missing(settings, name))
         if missing:
             raise ConfigError(f"{missing[0]} is missing; see --help")
-        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
         try:
-            function(values)
+            function(OmegaConf.to_container(settings, resolve=True, throw_on_missing=True))
         except ConfigError as error:
-            raise ConfigError(name_presets(str(error), settings)) from error
+            name_presets(error, settings)
+            raise
 
     def _run_in_hydra(self, words: Sequence[str]) -> None:
         """Run with an option of Hydra, such as ``--multirun`` or ``--cfg job``."""
@@ -311,46 +285,17 @@ def _first_of_sweeps(overrides: Sequence[str]) -> Iterator[str]:
         yield f"{override.get_key_element()}={first}" if is_sweep else override.input_line
 
 
-def _explain(error: HydraException, config: str, overrides: Sequence[str]) -> str:
-    """Return the message of an error of Hydra on one line, with the known names."""
-    first = str(error).splitlines()[0]
+def _explained(error: HydraException) -> ConfigError:
+    """Return an error of Hydra, with the known names if it is about one that is unknown."""
+    first, cause = str(error).splitlines()[0], error.__cause__
     if isinstance(error, OverrideParseException):
-        return f"cannot read {error.override!r}: {first}"
+        return ConfigError(f"cannot read {error.override!r}: {first}")
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, name = error.missing_cfg_file.rpartition("/")
         known = [option for option in error.options or () if option != "schema"]
-        return f"unknown {group} {name!r}.{known_names(name, known)}"
-    parsed = OverridesParser.create().parse_overrides(list(overrides))
-    is_preset = {each.input_line: _is_preset(each) for each in parsed}
-    try:  # what the presets alone give
-        base = compose(config, overrides=[line for line in overrides if is_preset[line]])
-    except HydraException:
-        return first
-    for override in parsed:
-        if not is_preset[override.input_line] and not override.is_add():
-            unknown = _unknown_name(base, override.key_or_group)
-            if unknown is not None:
-                return unknown
-    return first
-
-
-def _is_preset(override: Override) -> bool:
-    group = override.key_or_group.split("@")[0]
-    loader = GlobalHydra.instance().config_loader()
-    return group.startswith("hydra.") or bool(loader.get_group_options(group))
-
-
-def _unknown_name(settings: DictConfig, path: str) -> str | None:
-    """Return a message if there is no setting of that name, such as ``env.obs_size``."""
-    node: Any = settings
-    parts = path.split(".")
-    for index, part in enumerate(parts):
-        if not OmegaConf.is_dict(node):
-            return None
-        known = [str(key) for key in node]
-        if part not in known:  # `in` is False for a value that is missing
-            return f"unknown setting {'.'.join(parts[: index + 1])!r}.{known_names(part, known)}"
-        # the value itself is not read: it can be an interpolation of Hydra's settings
-        is_last = index == len(parts) - 1
-        node = None if is_last or OmegaConf.is_missing(node, part) else node[part]
-    return None
+        return UnknownNameError(group, name, known)
+    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
+        node = cause.parent_node
+        if known := [str(key) for key in node if key != "hydra"] if OmegaConf.is_dict(node) else []:
+            return UnknownNameError("setting", cause.full_key, known)
+    return ConfigError(first)

@@ -130,8 +130,8 @@ Text = Annotated[str, Field(min_length=1)]
 Plugins = Annotated[list[str], checked(load_plugins)]
 """Modules outside the package, imported at once; the first field of a model, as others use them."""
 TaskId = Annotated[str, checked(TASKS.__getitem__)]
-Tasks = Annotated[list[TaskId], Field(min_length=1)] | None
-"""Ids of tasks; None for all."""
+Tasks = Annotated[list[TaskId], Field(min_length=1), as_list] | None
+"""Ids of tasks, or one; None for all."""
 Folders = Annotated[
     list[Annotated[Text, checked(_folder_exists)]],
     Field(min_length=1),

@@ -106,7 +106,7 @@ def _escnn() -> Finding:
     try:
         import_escnn()
     except MissingPackageError as error:
-        return Finding("escnn", "not usable: no equivariant networks", str(error).split(": ")[1])
+        return Finding("escnn", "not usable: no equivariant networks", error.fix)
     return Finding("escnn", _version("escnn") or "without version")
 
 

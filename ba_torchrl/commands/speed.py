@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import Field
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text
+from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text, as_list
 from ba_torchrl.envs.settings import check_env
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
@@ -36,8 +36,8 @@ class Settings(EnvSettings):
         "seed": "set seed",
         "expert": "know that the expert acts",
     }
-    tasks: list[TaskId] = Field(
-        ["close_loop/block_picking", "open_loop/house_building_2"], min_length=1
+    tasks: Annotated[list[TaskId], Field(min_length=1), as_list] = Field(
+        ["close_loop/block_picking", "open_loop/house_building_2"]
     )
     """Ids of tasks."""
     env: dict[str, Any] = Field(default_factory=lambda: {"obs_size": 64})

@@ -20,7 +20,7 @@ from pydantic import (
 from pydantic_core import CoreSchema
 from typing_extensions import Self
 
-from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.errors import ConfigError, SettingsError, UnknownNameError
 
 Interval = tuple[float, float]
 
@@ -34,27 +34,32 @@ Which = Literal["best", "latest"]
 """Of a run's checkpoints, the one with the highest success rate in evaluation, or the last."""
 
 
-def explain(error: ValidationError, known: Iterable[str], what: str) -> ConfigError:
-    """Return pydantic's errors as one `ConfigError` that says what is allowed."""
-    known = sorted(known)
-    lines = []
+def explain(
+    error: ValidationError, known: Iterable[str], what: str, name: str = ""
+) -> SettingsError:
+    """Return pydantic's errors as one `SettingsError` that says what is allowed."""
+    problems = []
     for item in error.errors():
         field = ".".join(str(part) for part in item["loc"]) or "configuration"
         if item["type"] == "extra_forbidden":
-            end = known_names(field.split(".")[-1], known)
-            lines.append(f"unknown parameter {field!r}.{end}")
+            text = str(UnknownNameError("parameter", field, sorted(known)))
         else:
             message = item["msg"].removeprefix("Value error, ")
             given = repr(item["input"])
-            lines.append(f"{field}: {message}" + (f" (got {given})" if len(given) < 80 else ""))
-    return ConfigError(f"invalid {what}:\n  " + "\n  ".join(lines))
+            text = f"{field}: {message}" + (f" (got {given})" if len(given) < 80 else "")
+        problems.append((field, text))
+    return SettingsError(what, name, problems)
 
 
 Model = TypeVar("Model", bound=BaseModel)
 
 
 def parse(
-    model: type[Model], values: dict[str, Any], what: str, known: Iterable[str] | None = None
+    model: type[Model],
+    values: dict[str, Any],
+    what: str,
+    known: Iterable[str] | None = None,
+    name: str = "",
 ) -> Model:
     """Validate ``values`` as a ``model``.
 
@@ -63,14 +68,16 @@ def parse(
         values: field names and their values.
         what: what is being configured, for the error message.
         known: names that the message on an unknown one lists; those of all fields if None.
+        name: under which the model was chosen, for the message.
 
     Raises:
-        ConfigError: a name is unknown, a type wrong or a value out of range.
+        SettingsError: a name is unknown, a type wrong or a value out of range.
     """
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        raise explain(error, model.model_fields if known is None else known, what) from None
+        known = model.model_fields if known is None else known
+        raise explain(error, known, what, name) from None
 
 
 def _take_any_sequence(schema: Any) -> None:

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import difflib
+import errno
 import os
 import re
 import shlex
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 
 
@@ -15,23 +16,84 @@ class ConfigError(ValueError):
 
 
 class UnknownNameError(ConfigError, KeyError):
-    """A name that a registry does not hold; the message lists those it holds."""
+    """A name that is not among the known ones; the message lists them, the nearest one first.
+
+    Args:
+        kind: of what is named, such as "task".
+        name: as it was given. Of a dotted path, the last part is compared.
+        known: the names that are.
+        hint: end of the message.
+    """
+
+    def __init__(self, kind: str, name: object, known: Iterable[str], hint: str = "") -> None:
+        self.kind, self.name, self.known, self.hint = kind, name, list(known), hint
+        super().__init__(kind, name, self.known, hint)
 
     def __str__(self) -> str:
-        return str(self.args[0])
+        last = str(self.name).rpartition(".")[2]
+        word = re.compile(rf"(^|[_/.]){re.escape(last)}($|[_/.])")
+        close = [each for each in self.known if word.search(each)][:3]
+        close = close or difflib.get_close_matches(last, self.known, n=1)
+        meant = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+        known = ", ".join(self.known)
+        return f"unknown {self.kind} {self.name!r}.{meant} Known: {known}{self.hint}"
+
+
+class SettingsError(ConfigError):
+    """Settings of a part of a configuration that cannot be used.
+
+    Args:
+        kind: the part, such as "algorithm".
+        name: of the part if it is chosen by one, such as "sac"; else empty.
+        problems: fields, and what is wrong with them.
+    """
+
+    def __init__(self, kind: str, name: str, problems: list[tuple[str, str]]) -> None:
+        self.kind, self.name, self.problems = kind, name, problems
+        super().__init__(kind, name, problems)
+
+    def __str__(self) -> str:
+        named = f"{self.kind} {self.name!r}" if self.name else self.kind
+        return "\n  ".join([f"invalid {named}:", *(text for _, text in self.problems)])
+
+
+class PartError(ConfigError):
+    """A part of a configuration that does not fit the others.
+
+    Args:
+        kind: the part, such as "algorithm".
+        name: of the one that is chosen, such as "sac".
+        problem: what is wrong.
+        instead: names of those that fit, after ``before``; empty if the problem says what to do.
+        before: what takes them.
+    """
+
+    def __init__(
+        self, kind: str, name: str, problem: str, instead: Sequence[str] = (), before: str = ""
+    ) -> None:
+        self.kind, self.name, self.problem = kind, name, problem
+        self.instead, self.before = instead, before
+        super().__init__(kind, name, problem, instead, before)
+
+    def __str__(self) -> str:
+        end = f"; {self.before} take {self.kind}: {', '.join(self.instead)}" if self.instead else ""
+        return f"{self.kind} {self.name!r} {self.problem}{end}"
 
 
 class MissingPackageError(ConfigError, ImportError):
-    """An optional package that is not installed; the message says how to install it."""
+    """An optional package that is not installed.
 
+    Args:
+        what: needs it.
+        fix: the command that installs it.
+    """
 
-def known_names(name: str, known: Sequence[str]) -> str:
-    """Return the end of a message on an unknown name: the known ones that have it as a word, or the
-    nearest one, and all."""
-    close = [each for each in known if re.search(rf"(^|[_/.]){re.escape(name)}($|[_/.])", each)]
-    close = close[:3] or difflib.get_close_matches(name, known, n=1)
-    meant = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
-    return f"{meant} Known: {', '.join(known)}"
+    def __init__(self, what: str, fix: str) -> None:
+        self.what, self.fix = what, fix
+        super().__init__(what, fix)
+
+    def __str__(self) -> str:
+        return f"{self.what}: {self.fix}"
 
 
 def install_command(*packages: str) -> str:
@@ -73,14 +135,15 @@ class ReplaySchemaError(ValueError):
 
 
 def as_os_error(error: RuntimeError) -> OSError | None:
-    """Return the error of the operating system that a message of torch ends with, or None.
+    """Return the error of the operating system that torch's text tells of, or None.
 
-    torch raises RuntimeError for files and shared memory: "...: Too many open files (24)".
-
-    Args:
-        error: of torch.
+    torch raises RuntimeError for files and shared memory, "...: Too many open files (24)", and
+    where the memory of the CPU is exhausted.
     """
-    match = re.search(r"(.*): ([^:]+) \((\d+)\)$", str(error).strip(), re.DOTALL)
+    text = str(error).strip()
+    if "an't allocate memory" in text or "annot allocate memory" in text:
+        return OSError(errno.ENOMEM, f"{os.strerror(errno.ENOMEM)}: {text}")
+    match = re.search(r"(.*): ([^:]+) \((\d+)\)$", text, re.DOTALL)
     if match is None or os.strerror(int(match[3])) != match[2]:
         return None
     return OSError(int(match[3]), f"{match[2]}: {match[1]}")

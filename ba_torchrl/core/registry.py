@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
 
-from ba_torchrl.core.errors import ConfigError, UnknownNameError, known_names
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import load_entry_points
 
 T = TypeVar("T")
@@ -103,11 +103,11 @@ class Registry(Generic[T]):
         try:
             return self._entries[name]
         except KeyError:
-            raise UnknownNameError(
-                f"unknown {self.kind} {name!r}.{known_names(str(name), list(self))}. Entries from "
-                "outside the package are known once their module is imported (recipes: "
-                "'plugins=[module]'; worker processes: register_modules=[module])"
-            ) from None
+            hint = (
+                ". Entries from outside the package are known once their module is imported "
+                "(recipes: 'plugins=[module]'; worker processes: register_modules=[module])"
+            )
+            raise UnknownNameError(self.kind, name, self, hint) from None
 
     def __contains__(self, name: object) -> bool:
         self._scan()

@@ -95,8 +95,8 @@ def _read_yaml(path: Path) -> Any:
     try:
         import yaml
     except ImportError as error:
-        fix = f"mappings need a package that is not installed: {install_command('omegaconf')}"
-        raise MissingPackageError(fix) from error
+        what = "mappings need a package that is not installed"
+        raise MissingPackageError(what, install_command("omegaconf")) from error
     try:
         return yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, yaml.YAMLError) as error:

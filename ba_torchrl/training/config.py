@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from pydantic import Field
 
 from ba_torchrl.core.config import MAX_SEED, CompileMode, Source, WorkerOptions, changed, parse
-from ba_torchrl.core.errors import ConfigError, install_command
+from ba_torchrl.core.errors import ConfigError, PartError, install_command
 from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.record.logging import Backend
@@ -234,10 +234,8 @@ class ExperimentConfig(WorkerOptions):
         if config.pretrain_updates and not config.demonstrations:
             raise ConfigError("pretrain_updates needs demonstrations")
         if not config.algorithm_config.collects and not config.demonstrations:
-            raise ConfigError(
-                f"algorithm {config.algorithm['name']!r} learns from demonstrations only; set "
-                "demonstrations"
-            )
+            why = "learns from demonstrations only; set demonstrations"
+            raise PartError("algorithm", config.algorithm["name"], why)
         option = config.algorithm_config.pretraining_option
         if option is not None and not config.pretrain_updates:
             raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
@@ -249,8 +247,8 @@ class ExperimentConfig(WorkerOptions):
             )
         config.collector_config.check(config.num_envs)
         if config.compile_mode is not None and not config.algorithm_config.is_compilable:
-            name = config.algorithm["name"]
-            raise ConfigError(f"compile_mode: algorithm {name!r} cannot be compiled; leave it out")
+            why = "cannot be compiled; leave out compile_mode"
+            raise PartError("algorithm", config.algorithm["name"], why)
         config._check_demonstrations()
         if config.logger != "csv" and find_spec(config.logger) is None:
             raise ConfigError(
@@ -384,4 +382,4 @@ def choose(registry: Any, values: dict[str, Any], kind: str) -> Any:
     name = rest.pop("name", None)
     if name is None:
         raise ConfigError(f"{kind}.name is missing; known: {', '.join(registry)}")
-    return parse(registry[name], rest, f"{kind} {name!r}")
+    return parse(registry[name], rest, kind, name=name)

@@ -23,7 +23,7 @@ from omegaconf import OmegaConf
 from pydantic import BaseModel
 
 from ba_torchrl.core.config import EnvConfig
-from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.errors import UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
@@ -155,7 +155,7 @@ def preset(group: str, name: str) -> dict[str, Any]:
             "rad_sac". Hydra must have been started with that ``configs`` folder.
 
     Raises:
-        ConfigError: there is no such preset; the message lists the known ones.
+        UnknownNameError: there is no such preset.
     """
     if not _is_complete[0]:
         register()
@@ -169,7 +169,7 @@ def preset(group: str, name: str) -> dict[str, Any]:
         if parts and parts[0] in preset_names(other):
             overrides.append(f"+{other}={parts.pop(0)}")
     if not first or parts:
-        raise ConfigError(f"unknown {group} {name!r}.{known_names(name, known)}")
+        raise UnknownNameError(group, name, known)
     settings = compose(overrides=overrides)
     return OmegaConf.to_container(settings[group], resolve=True)
 

@@ -58,7 +58,8 @@ def check_packages(config: ExperimentConfig) -> None:
     """
     needed = ["matplotlib", *(("imageio", "imageio_ffmpeg") if config.video_episodes else ())]
     if missing := [name.replace("_", "-") for name in needed if find_spec(name) is None]:
-        raise MissingPackageError(f"a run's curve and video need {install_command(*missing)}")
+        what = "a run's curve and video need packages that are not installed"
+        raise MissingPackageError(what, install_command(*missing))
 
 
 def plot_curve(config: ExperimentConfig, curve: list[CurvePoint]) -> Path:

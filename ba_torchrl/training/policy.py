@@ -28,7 +28,7 @@ from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import StrictModel, explain
-from ba_torchrl.core.errors import ConfigError, known_names
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
@@ -293,10 +293,8 @@ def load_policy(
     else:
         path = Path(source)
         if not path.exists():
-            raise ConfigError(
-                f"{source} is neither a run folder, a file of a policy nor a task with a trained "
-                f"policy.{known_names(str(source), shipped_policies())}"
-            )
+            hint = f"; and there is no run folder and no file of a policy {source}"
+            raise UnknownNameError("policy", str(source), shipped_policies(), hint)
     if path.suffix != TENSORS:
         checkpoint = find_checkpoint(path, which)
         config, algorithm = load(checkpoint, **changes)

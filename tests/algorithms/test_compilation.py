@@ -197,12 +197,22 @@ def test_a_run_without_it_is_not_compiled(tmp_path):
 @pytest.mark.parametrize(
     ("name", "mode", "before_the_run", "of_the_learner"),
     [
-        ("rlpd", "default", "algorithm 'rlpd'", "this algorithm cannot be compiled"),
-        ("sac", "fast", ".*reduce-overhead", "'fast' is unknown; known: default, reduce-overhead"),
+        (
+            "rlpd",
+            "default",
+            "algorithm 'rlpd' cannot be.*compile_mode",
+            "this algorithm cannot be compiled",
+        ),
+        (
+            "sac",
+            "fast",
+            "compile_mode.*reduce-overhead",
+            "'fast' is unknown; known: default, reduce-overhead",
+        ),
     ],
 )
 def test_what_cannot_be_compiled_is_refused(tmp_path, name, mode, before_the_run, of_the_learner):
-    with pytest.raises(ConfigError, match=f"compile_mode.*{before_the_run}"):
+    with pytest.raises(ConfigError, match=before_the_run):
         make_experiment(tmp_path, "cnn", {"name": name}, compile_mode=mode)
     with pytest.raises(ConfigError, match=f"compile_mode: {of_the_learner}"):
         build(name, "cnn").compile(mode)

@@ -117,7 +117,7 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
         (["train", "env.workspace=[1,2"], "cannot read 'env.workspace=[1,2'"),
         (["train", "block_picking"], "'block_picking' sets nothing; settings are FIELD=VALUE"),
         (["evaluate"], "policy is missing; see --help"),
-        (["evaluate", "a", "b"], "one policy is expected, got a b"),
+        (["evaluate", "a", "b"], "policy: Input should be a valid string (got ['a', 'b'])"),
         (["evaluate", "a", "policy=b"], "policy is given twice"),
         (["evaluate", "close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
         (["doctor", "now"], "doctor has no settings"),

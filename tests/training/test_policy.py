@@ -210,7 +210,7 @@ def test_wilson_interval():
 def test_what_is_no_policy_is_named(run, tmp_path):
     with pytest.raises(ConfigError, match=r"is shipped; those that are: close_loop/block_in_bowl"):
         ba_torchrl.load_policy("open_loop/covid_test")
-    with pytest.raises(ConfigError, match="neither a run folder"):
+    with pytest.raises(ConfigError, match="no run folder and no file"):
         ba_torchrl.load_policy(tmp_path / "none")
     with pytest.raises(ConfigError, match="Did you mean 'close_loop/block_picking'"):
         ba_torchrl.load_policy("close_loop/block_pickng")

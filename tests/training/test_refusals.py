@@ -21,7 +21,6 @@ OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
         ("train", "escnn", ("network=equi", "algorithm=sac", "run_dir=new")),
         ("train", "escnn", ("network=equi_fcn", *OPEN, "run_dir=new")),
         ("benchmark", "escnn", ("benchmark=close_loop_small", "folder=new")),
-        ("plot", "matplotlib.figure", ("runs=[run]",)),
     ],
 )
 def test_a_missing_package_is_one_line(name, package, overrides, capsys, monkeypatch, tmp_path):

@@ -236,8 +236,8 @@ class Format(ABC):
             return importlib.import_module(module)
         except ImportError as error:
             raise MissingPackageError(
-                f"this format needs a package that is not installed ({error}): "
-                f"{install_command(self.package)}{self.hint}"
+                f"this format needs a package that is not installed ({error})",
+                install_command(self.package) + self.hint,
             ) from error
 
 

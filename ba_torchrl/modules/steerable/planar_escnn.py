@@ -23,7 +23,7 @@ import numpy as np
 
 from ba_torchrl.core.errors import MissingPackageError, install_command
 
-ESCNN_FIX = "equivariant networks need escnn: pip install --no-deps escnn==1.0.11"
+ESCNN_FIX = "pip install --no-deps escnn==1.0.11"
 _NAMES = ("lie_learn", "representations", "SO3", "wigner_d")
 
 
@@ -45,10 +45,9 @@ def import_escnn(name: str = "escnn") -> ModuleType:
             coefficients = importlib.import_module("escnn.group._clebsh_gordan")
     except ImportError as error:
         other = (error.name or "").split(".")[0]  # a package that escnn imports
-        fix = ESCNN_FIX
-        if other not in ("", "escnn"):
-            fix = f"equivariant networks need {other}: {install_command(other)}"
-        raise MissingPackageError(fix) from error
+        missing = other or "escnn"
+        fix = ESCNN_FIX if missing == "escnn" else install_command(missing)
+        raise MissingPackageError(f"equivariant networks need {missing}", fix) from error
     # scikit-learn's singular value decomposition refuses the matrices that escnn gives it; where
     # scikit-learn is not installed, escnn takes SciPy's.
     numerical.randomized_svd = None
@@ -110,5 +109,5 @@ def _forget(package: str) -> None:
 
 def _raise(*_: Any, **__: Any) -> None:
     raise MissingPackageError(
-        "escnn's representations of SO(3) need lie_learn and NumPy 1: pip install lie_learn"
+        "escnn's representations of SO(3) need lie_learn and NumPy 1", "pip install lie_learn"
     )
