@@ -13,7 +13,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import MAIN, check_spawned_process_knows, import_modules
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.robots.base import ROBOTS, Robot
-from ba_torchrl.tasks.base import TASKS, Task, TaskSettings, check_scales
+from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 
@@ -224,6 +224,21 @@ def _with_defaults(task_class: type[Task], config: EnvConfig) -> EnvConfig:
         defaults["in_hand_size"] = task_class.default_in_hand_size
     missing = {name: value for name, value in defaults.items() if getattr(config, name) is None}
     return config.model_copy(update=missing)
+
+
+def check_scales(task_id: str, scales: tuple[float, float]) -> None:
+    """Check that scales are within the limits of a task.
+
+    Raises:
+        ConfigError: a scale is outside the limits.
+    """
+    least, most = TASKS[task_id].scale_limits
+    low, high = scales
+    if round(low, 6) < least or round(high, 6) > most:
+        allowed = f"{least:g} to {most:g}" if least < most else f"{least:g} only"
+        raise ConfigError(
+            f"{task_id}: `object_scale_range` must lie within {allowed}, not ({low:g}, {high:g})"
+        )
 
 
 def _check_task_supports(task_id: str, config: EnvConfig) -> None:

@@ -15,7 +15,7 @@ import numpy as np
 
 from ba_torchrl.core.actions import GripperCommand, PickPlaceCommand
 from ba_torchrl.core.config import TaskParameters
-from ba_torchrl.core.errors import ConfigError, PlacementError
+from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import Matrix, YawPose
@@ -283,11 +283,7 @@ class Task(ABC):
     # -- random poses ------------------------------------------------------------------------
 
     def random_point(self, rng: np.random.Generator, padding_m: float) -> tuple[float, float]:
-        """Return a random point of the ground at least half of ``padding_m`` from the border.
-
-        Raises:
-            PlacementError: the workspace is too small.
-        """
+        """Return a random point of the ground at least half of ``padding_m`` from the border."""
         return self.terrain.spawn_area.random_point(rng, padding_m)
 
     def random_yaw(self, rng: np.random.Generator, span_rad: float) -> float:
@@ -393,27 +389,8 @@ def versions_of(task_id: str) -> Versions:
     return Versions(task_class.version, task_class.expert_version)
 
 
-def check_scales(task_id: str, scales: tuple[float, float]) -> None:
-    """Check that scales are within the limits of a task.
-
-    Raises:
-        ConfigError: a scale is outside the limits.
-    """
-    least, most = TASKS[task_id].scale_limits
-    low, high = scales
-    if round(low, 6) < least or round(high, 6) > most:
-        allowed = f"{least:g} to {most:g}" if least < most else f"{least:g} only"
-        raise ConfigError(
-            f"{task_id}: `object_scale_range` must lie within {allowed}, not ({low:g}, {high:g})"
-        )
-
-
 def _as_bool(value: Any, what: str) -> bool:
-    """Return a bool of Python, NumPy or torch, also as an array of one element, as Python's.
-
-    Raises:
-        TypeError: it is none.
-    """
+    """Return a bool of Python, NumPy or torch, also as an array of one element, as Python's."""
     if type(value) is bool:
         return value
     array = np.asarray(value)

@@ -23,17 +23,19 @@ from ba_torchrl.tasks.manipulation.clearance import (
     OUTER_MARGIN_M,
     SIDE_MARGIN_M,
     finger_ranges_m,
-    finger_rectangles,
     grasp_clearance_m,
+    passing_height_m,
+    tips_below_tool_m,
+)
+from ba_torchrl.tasks.manipulation.footprints import Rectangle
+from ba_torchrl.tasks.manipulation.hand_clearance import (
+    finger_rectangles,
     hand_clearance_m,
     hand_rectangle,
     knuckles_m,
     outline_clearances_m,
-    passing_height_m,
-    tips_below_tool_m,
     tool_clearances_m,
 )
-from ba_torchrl.tasks.manipulation.footprints import Rectangle
 
 EDGE_M = 0.03
 GRIPPER = Gripper(

@@ -5,7 +5,8 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.tasks.base import TASKS, check_scales
+from ba_torchrl.envs.settings import check_scales
+from ba_torchrl.tasks.base import TASKS
 from tests.specs import slow_except
 
 FIXED = {"action_sequence": "pxyz", "random_orientation": False}

@@ -111,9 +111,6 @@ class DrawerOpening(CloseLoopTask):
         """Place the cabinet beside the workspace, with its front towards the centre.
 
         One layout in five is rejected, as its handle leaves the workspace before the goal.
-
-        Raises:
-            PlacementError: no layout was found.
         """
         scale = self.settings.scale
         x, y = self.settings.workspace.center

@@ -16,9 +16,10 @@ from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.clearance import half_gap_m, outline_clearances_m
+from ba_torchrl.tasks.manipulation.clearance import half_gap_m
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
+from ba_torchrl.tasks.manipulation.hand_clearance import outline_clearances_m
 from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, pick_command
 from ba_torchrl.tasks.packing.base import FILLING_ORDERS, RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter

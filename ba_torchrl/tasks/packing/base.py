@@ -17,9 +17,10 @@ from ba_torchrl.sim.meshes import box_mesh, frame_parts, merge_meshes, transform
 from ba_torchrl.sim.shapes import Color, Solid
 from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.body_pool import BodyPool
-from ba_torchrl.tasks.manipulation.clearance import half_gap_m, hand_rectangle, outline_clearances_m
+from ba_torchrl.tasks.manipulation.clearance import half_gap_m
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gaps_m, narrowest, outline
 from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
+from ba_torchrl.tasks.manipulation.hand_clearance import hand_rectangle, outline_clearances_m
 from ba_torchrl.tasks.manipulation.pick_place_commands import place_command
 
 SCALE = 0.8

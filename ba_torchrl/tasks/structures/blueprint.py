@@ -101,11 +101,7 @@ class Slot:
 
 @dataclass(frozen=True)
 class Blueprint:
-    """A structure: its slots from the bottom up.
-
-    Raises:
-        ValueError: a slot rests on a later slot or on more than two, or a bridge has no span.
-    """
+    """A structure: its slots from the bottom up."""
 
     slots: tuple[Slot, ...]
 

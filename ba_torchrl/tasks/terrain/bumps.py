@@ -119,11 +119,7 @@ class Bumps(SlopedTerrain):
         return self.layout.platform
 
     def initialize_episode(self, rng: np.random.Generator) -> None:
-        """Draw the pyramids, their heading, and the pose of the platform inside the workspace.
-
-        Raises:
-            PlacementError: the workspace is too small for the platform.
-        """
+        """Draw the pyramids, their heading, and the pose of the platform inside the workspace."""
         pyramids = rng.choice(VARIANTS, size=PYRAMIDS_PER_ROW**2, replace=False)
         heading = float(rng.uniform(0.0, math.pi))
         yaw = float(rng.uniform(0.0, 2 * math.pi)) if self.random_orientation else math.pi / 2

@@ -132,15 +132,7 @@ class SlopedTerrain(Terrain):
         *,
         base: Body,
     ) -> None:
-        """Place bodies at random poses where they may start, apart from each other.
-
-        Args:
-            draw_yaw: returns a random yaw of a body.
-            base: one of the bodies, which starts in the build area if any does.
-
-        Raises:
-            PlacementError: no layout was found.
-        """
+        """Place bodies at random poses where they may start, apart from each other."""
         for _ in range(LAYOUT_ATTEMPTS // POSE_ATTEMPTS):
             poses: dict[Body, tuple[tuple[float, float], float]] = {}
             pose = self.random_base_pose(rng, base, draw_yaw)
