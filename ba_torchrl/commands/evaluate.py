@@ -2,7 +2,7 @@
 
 ba-torchrl evaluate runs/my-run episodes=100 video=my-run.mp4
 ba-torchrl evaluate runs/my-run which=latest
-ba-torchrl evaluate trained task=close_loop/block_picking
+ba-torchrl evaluate close_loop/block_picking       # that which the package ships
 ba-torchrl evaluate trained folder=runs/trained    # all that the package ships; resumable
 """
 
@@ -17,7 +17,6 @@ from ba_torchrl.cli.types import (
     OutputFolder,
     PluginSettings,
     Seed,
-    TaskId,
     Text,
     VectorSettings,
     VideoFile,
@@ -38,8 +37,8 @@ class EpisodeSettings(VectorSettings, PluginSettings):
     """A policy and the episodes that it plays."""
 
     policy: Text
-    """A run folder, one of the checkpoints in it, a .safetensors file, or in evaluate "trained" for
-    those that the package ships."""
+    """A run folder, one of the checkpoints in it, a .safetensors file, a task whose policy the
+    package ships, or in evaluate "trained" for all of these."""
     which: Which = "best"
     """Of a run folder: the checkpoint with the best evaluation, or the latest."""
     device: Text = "auto"
@@ -53,10 +52,8 @@ class Settings(EpisodeSettings):
 
     seed: Seed | None = None
     """Of the first of other episodes; null for those of the protocol, which training never used."""
-    task: TaskId | None = None
-    """Of policy=trained; null for all of them."""
     folder: OutputFolder | None = None
-    """Of policy=trained: the record of each policy as JSON, whose episodes are not played again."""
+    """Of policies from files: the record of each as JSON, whose episodes are not played again."""
     video: VideoFile | None = None
     """A file such as evaluation.mp4 or evaluation.gif."""
     video_episodes: Count = 5
@@ -67,23 +64,13 @@ def main(settings: Settings) -> None:
     """Play greedy episodes with a policy, or with every policy that the package ships."""
     from ba_torchrl.training.policy import shipped_policies
 
-    if settings.policy != "trained":
-        if settings.task is not None:
-            raise ConfigError("task: the policy names its task; leave it out")
-        if settings.folder is not None:
-            raise ConfigError("folder: it is for policy=trained; leave it out")
-        _evaluate(settings.policy, settings)
-    elif settings.folder is not None and settings.video is not None:
-        raise ConfigError("folder: it keeps success and length; leave out video")
-    elif settings.folder is not None and settings.seed is not None:
+    sources = shipped_policies() if settings.policy == "trained" else [settings.policy]
+    if settings.video is not None and len(sources) > 1:
+        raise ConfigError("video: name one policy")
+    if settings.folder is not None and settings.seed is not None:
         raise ConfigError("folder: it keeps records under the protocol; leave out seed")
-    elif settings.task is not None:
-        _evaluate(settings.task, settings)
-    else:
-        if settings.video is not None:
-            raise ConfigError("video: name the task of the policy")
-        for task in shipped_policies():
-            _evaluate(task, settings)
+    for source in sources:
+        _evaluate(source, settings)
 
 
 def play(
@@ -121,6 +108,8 @@ def _evaluate(source: str, settings: Settings) -> None:
     from ba_torchrl.training.protocol import PROTOCOL
 
     policy = load_policy(source, settings.which, settings.device)
+    if settings.folder is not None and policy.card is None:
+        raise ConfigError("folder: it is for policies from files; a run has its result.json")
     seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
     if settings.folder is None:
         found = play(policy, settings, seed)

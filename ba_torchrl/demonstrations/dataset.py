@@ -26,7 +26,7 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
         dataset_id: path of demonstrations below ``root``, as `load_demonstrations` takes it; of
             graded sets, such as ``close_loop/block_picking/expert``.
         batch_size: of a sample; None if each call of ``sample`` passes it.
-        root: folder of data sets, such as that of ``ba-torchrl collect source=graded``; by default
+        root: folder of data sets, such as that of ``ba-torchrl graded``; by default
             the present one.
         task, env, mapping: as for `load_demonstrations`.
         split_trajs: items are episodes, padded to the longest, with ``mask``; else transitions.

@@ -366,8 +366,8 @@ def save_policy(policy: TrainedPolicy, path: str | Path, test: TestedPolicy) -> 
     for name in ("run_dir", "resume", "device", *_OF_TRAINING):
         del config[name]
     is_shipped = path.resolve() == shipped_file(policy.task)
-    words = ["policy=trained", f"task={policy.task}"] if is_shipped else [f"policy={path.name}"]
-    words.append(f"episodes={test.episodes}")
+    source = policy.task if is_shipped else path.name
+    words = [f"policy={source}", f"episodes={test.episodes}"]
     if policy.config.plugins:
         words.append(f"plugins=[{','.join(policy.config.plugins)}]")
     card = PolicyCard(

@@ -36,6 +36,7 @@ COMMANDS = (
     "experts",
     "export",
     "gallery",
+    "graded",
     "leaderboard",
     "play",
     "plot",

@@ -121,7 +121,6 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
         (["evaluate", "a", "policy=b"], "policy is given twice"),
         (["evaluate", "close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
         (["doctor", "now"], "doctor has no settings"),
-        (["evaluate", "trained", "task=open_loop/covid_tets"], "unknown task 'open_loop/covid_"),
         (["play"], "task is missing"),
         (["play", "--config-name", "x"], "play has no configuration files"),
         (["benchmark", "benchmark=close_loop_4"], "Did you mean 'close_loop_4d'?"),

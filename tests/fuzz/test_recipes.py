@@ -13,6 +13,7 @@ from tests.recipes import load_recipe
 
 WORK = {
     "collect": "ba_torchrl.envs.factory.make_vector_env",
+    "graded": "ba_torchrl.training.graded.untrained",
     "experts": "ba_torchrl.demonstrations.collect.expert_scores",
     "play": "ba_torchrl.training.evaluation.record_episodes",
     "soak": "run_soak",

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
-from ba_torchrl.commands import collect
+from ba_torchrl.commands import graded as command
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import complete_only
 from ba_torchrl.demonstrations import load_demonstrations
@@ -143,10 +143,10 @@ def test_a_task_without_half_success_is_refused(sets, rates, found, monkeypatch,
 def test_the_command_makes_all_sets_and_flags_a_medium_far_from_half(
     tmp_path, rates, monkeypatch, capsys
 ):
-    words = "source=graded episodes=3 num_envs=1 parallel=false env.obs_size=64 env.max_steps=4"
-    task, path = f"task=[{TASK}]", f"path={tmp_path}"
+    words = "episodes=3 num_envs=1 parallel=false env.obs_size=64 env.max_steps=4"
+    task, path = f"tasks=[{TASK}]", f"path={tmp_path}"
     with pytest.raises(ConfigError, match=r"medium: success is not from 0.3 to 0.7"):
-        collect.COMMAND.run.__wrapped__(collect.COMMAND, [*words.split(), task, path])
+        command.COMMAND.run.__wrapped__(command.COMMAND, [*words.split(), task, path])
     lines = capsys.readouterr().out.splitlines()
     assert [line.split(":")[0] for line in lines if line.startswith(TASK)] == [
         f"{TASK} {grade}" for grade in GRADES
@@ -160,14 +160,15 @@ def test_the_command_makes_all_sets_and_flags_a_medium_far_from_half(
         ("env.obs_size=32", "this network takes images of 64 or 128 px, got 32"),
         ("env.obs_type=vec", "the networks take images"),
         ("env.obs_sze=3", "unknown parameter 'obs_sze'"),
-        (f"task=[{TASK},{TASK}]", "task: name each one once"),
+        (f"tasks=[{TASK},{TASK}]", "tasks: name each one once"),
     ],
 )
-def test_the_command_refuses_settings_before_it_makes_a_folder(tmp_path, word, message):
-    words = ["source=graded", word, f"path={tmp_path}/new"]
+def test_the_command_refuses_settings_before_it_makes_a_set(tmp_path, word, message):
+    words = [f"tasks=[{TASK}]", f"path={tmp_path}/new"]
+    words = [word, words[1]] if word.startswith("tasks") else [word, *words]
     with pytest.raises(ConfigError, match=message):
-        collect.COMMAND.run.__wrapped__(collect.COMMAND, words)
-    assert not (tmp_path / "new").exists()
+        command.COMMAND.run.__wrapped__(command.COMMAND, words)
+    assert not list(tmp_path.glob("new/*"))
 
 
 def test_random_actions_of_open_loop_have_the_primitive_that_has_an_effect(tmp_path):

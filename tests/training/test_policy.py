@@ -248,7 +248,7 @@ def test_what_is_no_policy_is_named(run, tmp_path):
 def test_the_cards_of_shipped_policies_name_the_command_that_finds_them():
     shipped = policies.shipped_policies()
     commands = {task: ba_torchrl.load_policy(task).card.evaluate for task in shipped}
-    start = "ba-torchrl evaluate policy=trained task="
+    start = "ba-torchrl evaluate policy="
     assert [task for task in shipped if not commands[task].startswith(f"{start}{task} ")] == []
 
 
@@ -329,7 +329,7 @@ def test_records_of_the_shipped_policies_are_kept_and_give_the_cards_their_numbe
     ):
         file.write_text(changed)
         recipe("evaluate", *words)
-    recipe("evaluate", "trained", f"task={task}", *words[1:], "num_envs=2")
+    recipe("evaluate", task, *words[1:], "num_envs=2")
     assert played == [20] * 4
     recipe("evaluate", *words[:2], "episodes=200")
     for name in (policies.TENSORS, policies.CARD):
@@ -339,17 +339,13 @@ def test_records_of_the_shipped_policies_are_kept_and_give_the_cards_their_numbe
     assert shipped_records.take(file) == f"{task}: 0.500 over 200 episodes"
     card = policies.read_card(tmp_path / "p.safetensors")
     assert (card.success_rate, card.episodes, card.protocol) == (0.5, 200, 1)
-    assert card.evaluate == f"ba-torchrl evaluate policy=trained task={task} episodes=200"
+    assert card.evaluate == f"ba-torchrl evaluate policy={task} episodes=200"
     (tmp_path / "p.safetensors").write_bytes(b"other")
     with pytest.raises(ValueError, match=f"another policy of {task} is shipped"):
         shipped_records.take(file)
-    for refused, message in (
-        (("nothere", *words[1:]), "folder: it is for policy=trained"),
-        ((*words, "seed=3"), "under the protocol; leave out seed"),
-    ):
-        with pytest.raises(SystemExit):
-            recipe("evaluate", *refused)
-        assert message in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        recipe("evaluate", *words, "seed=3")
+    assert "under the protocol; leave out seed" in capsys.readouterr().err
 
 
 def test_a_shipped_policy_has_one_number_in_card_and_record():
