@@ -22,7 +22,7 @@ help:
 	@echo "make setup      create $(VENV) with everything this project uses"
 	@echo "make train      the quick start: train, evaluate, write curves and a video"
 	@echo "make test       the tests (minutes)"
-	@echo "make test-slow  the tests that take longer"
+	@echo "make test-slow  products of tasks, robots and networks, many episodes"
 	@echo "make test-versions  the lowest and newest versions, in fresh environments (gigabytes)"
 	@echo "make docs       the site, in docs/_build/html"
 	@echo "make lint       check style; list long files, deep classes and lines to read"

@@ -13,7 +13,11 @@ from ba_torchrl.sim.robots.base import ROBOTS
 def slow_except(values, fast):
     """Return the cases of a sweep, of which all but some are slow tests."""
     return [
-        value if value in fast else pytest.param(value, marks=pytest.mark.slow) for value in values
+        pytest.param(
+            *(value if isinstance(value, tuple) else (value,)),
+            marks=[pytest.mark.slow] * (value not in fast),
+        )
+        for value in values
     ]
 
 

@@ -28,6 +28,7 @@ from ba_torchrl.demonstrations import (
 from ba_torchrl.demonstrations.collect import RandomActions, source_config
 from ba_torchrl.training.policy import read_card, shipped_file
 from tests.algorithms.tiny import build, transitions
+from tests.specs import slow_except
 
 PICKING, STACKING = "close_loop/block_picking", "open_loop/block_stacking"
 SMALL = {"obs_size": 32, "seed": 0}
@@ -225,7 +226,17 @@ def assert_same(found, expected):
         assert found == expected
 
 
-@pytest.mark.parametrize("name", RETURNED)
+SLOW = [f"learner, spatial_q {name}" for name in ("fcn", "rot_fcn", "equi_fcn")]
+SLOW += [
+    "learner, sac ferm",
+    "learner, rlpd equi",
+    "learner, bc equi",
+    "policy, CNN",
+    "policy, ASR",
+]
+
+
+@pytest.mark.parametrize("name", slow_except(RETURNED, {*RETURNED} - {*SLOW}))
 def test_a_copy_behaves_like_the_original(name, returned):
     thing, use = returned(name), RETURNED[name][1]
     others = [copy.deepcopy(thing), pickle.loads(pickle.dumps(thing))]

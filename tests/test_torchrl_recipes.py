@@ -5,6 +5,7 @@ import contextlib
 import importlib
 import importlib.util
 from functools import partial
+from itertools import product
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
 import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.data import ImageCodecs, as_transitions
+from tests.specs import slow_except
 
 FOLDER = Path(__file__).parents[1] / "recipes" / "torchrl"
 REACH = "close_loop/block_reaching"
@@ -130,7 +132,8 @@ def test_the_folder_does_not_hide_torchrl():
     assert not (FOLDER / "__init__.py").exists()
 
 
-TASKS = {REACH: {}, "open_loop/block_stacking": {"num_objects": 2}}
+STACKING = "open_loop/block_stacking"
+TASKS = {REACH: {}, STACKING: {"num_objects": 2}}
 BATCHED = {
     "SerialEnv": envs.SerialEnv,
     "SerialEnv, without buffers": partial(envs.SerialEnv, use_buffers=False),
@@ -148,8 +151,10 @@ def makers(task, **options):
     return [partial(make, seed=seed) for seed in (3, 4)]
 
 
-@pytest.mark.parametrize("task", TASKS)
-@pytest.mark.parametrize("name", BATCHED)
+@pytest.mark.parametrize(
+    ("task", "name"),
+    slow_except([*product(TASKS, BATCHED)], [*product([REACH], BATCHED), (STACKING, "SerialEnv")]),
+)
 def test_environments_in_a_vector_of_torchrl(name, task):
     alone = [make() for make in makers(task)]
     expected = torch.stack([env.reset() for env in alone])

@@ -166,7 +166,7 @@ def test_blocks_are_shared_in_the_process():
     assert kernel_block(again, again.regular_repr, again.regular_repr, 3) is regular
 
 
-@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("sign", [-1, pytest.param(1, marks=pytest.mark.slow)])
 def test_kernels_of_dihedral_groups_do_not_depend_on_signs_of_singular_vectors(sign, monkeypatch):
     """Weights of policies refer to kernels with these signs; the sums were recorded on one CPU."""
     coefficients = planar_escnn.import_escnn("escnn.group._clebsh_gordan")

@@ -1,6 +1,7 @@
 """Errors name what the user wrote, and packages that are missing."""
 
 import json
+import re
 import sys
 
 import pytest
@@ -64,10 +65,9 @@ def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path
 @pytest.mark.parametrize(
     ("overrides", "message"),
     [
-        (("algorithm=dqn", "network=equi"), "algorithm 'dqn' learns open_loop tasks"),
         (
             ("algorithm=dqn", "network=equi"),
-            "take algorithm: bc, dagger, drq, ferm, iql, rad, rlpd",
+            "algorithm 'dqn' learns open_loop tasks.*take algorithm: bc, dagger, drq, ferm, iql",
         ),
         (("algorithm=sac", "network=rot_fcn"), "network 'rot_fcn' is for open_loop tasks"),
         (("task=open_loop/block_stacking", *OPEN[1:], "network=equi_d4"), "network 'equi_d4' is"),
@@ -77,4 +77,4 @@ def test_the_command_line_names_presets(overrides, message, capsys, monkeypatch,
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit):
         recipe("train", *overrides, "run_dir=new")
-    assert message in capsys.readouterr().err
+    assert re.search(message, capsys.readouterr().err)

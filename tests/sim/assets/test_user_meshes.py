@@ -12,6 +12,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets import graspnet, hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes
+from tests.specs import slow_except
 
 CORNERS = [(0, 0), (60, 0), (60, 30), (30, 30), (30, 60), (0, 60)]  # mm, of an L
 VERTICES = [(x / 1000, y / 1000, z) for z in (0.0, 0.04) for x, y in CORNERS]
@@ -157,7 +158,10 @@ def volume(shape):
 
 
 @pytest.mark.parametrize(
-    ("scale", "offset_m"), [(1.0, 3e5), (1.0, 5e6), (3e-4, 0.0), (1e5, 0.0), (1.0, 1e9)]
+    ("scale", "offset_m"),
+    slow_except(
+        [(1.0, 3e5), (1.0, 5e6), (3e-4, 0.0), (1e5, 0.0), (1.0, 1e9)], [(1.0, 5e6), (1e5, 0.0)]
+    ),
 )
 def test_size_and_position_of_a_mesh_do_not_change_its_shape(tmp_path, scale, offset_m):
     plain = ell()
@@ -245,8 +249,9 @@ OPEN = {
 }
 
 
-@pytest.mark.parametrize(("mesh", "expected"), OPEN.values(), ids=OPEN)
-def test_an_open_surface_is_closed_and_reported(tmp_path, caplog, mesh, expected):
+@pytest.mark.parametrize("name", slow_except(OPEN, ["L without bottom", "truncated ball"]))
+def test_an_open_surface_is_closed_and_reported(tmp_path, caplog, name):
+    mesh, expected = OPEN[name]
     used = mesh.vertices[np.unique(mesh.faces)]
     expected = expected or hulls.volume_and_center(hulls.convex_hull(used))[0]
     for _ in range(2):  # the second time from the cache
@@ -284,7 +289,7 @@ CLOSED = {
 }
 
 
-@pytest.mark.parametrize("name", CLOSED)
+@pytest.mark.parametrize("name", slow_except(CLOSED, ["mixed winding", "nearly twice"]))
 def test_surfaces_that_enclose_a_solid_are_decomposed_into_it(tmp_path, caplog, name):
     with caplog.at_level(logging.WARNING):
         shape = load(tmp_path, CLOSED[name])

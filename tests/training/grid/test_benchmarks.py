@@ -38,13 +38,13 @@ GRIDS = [
     ("close_loop_small", 1, 13),
     ("cpu_six_dof", 9, 12),
     ("equivariance", 3, 9),
-    ("open_loop_6d", 9, 45),
     pytest.param("close_loop_3d", 10, 170, marks=SLOW),
     pytest.param("close_loop_4d", 10, 170, marks=SLOW),
     pytest.param("cpu_close_loop", 10, 35, marks=SLOW),
     pytest.param("cpu_open_loop", 12, 21, marks=SLOW),
     pytest.param("open_loop_2d", 12, 96, marks=SLOW),
     pytest.param("open_loop_3d", 12, 96, marks=SLOW),
+    pytest.param("open_loop_6d", 9, 45, marks=SLOW),
 ]
 
 
