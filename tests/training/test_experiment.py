@@ -343,7 +343,7 @@ def test_demonstrations_of_another_library_are_those_of_the_folder(tmp_path):
 
 
 def test_a_logger_without_its_package_is_refused(tmp_path, monkeypatch):
-    monkeypatch.setattr("ba_torchrl.training.config.is_available", lambda backend: False)
+    monkeypatch.setattr("ba_torchrl.training.config.find_spec", lambda backend: None)
     with pytest.raises(ConfigError, match=r"pip install .*wandb"):
         tiny(tmp_path, logger="wandb")
 
