@@ -1,75 +1,151 @@
-"""Checkpoints of a run, and the configuration from which they are rebuilt."""
+"""Files of a run: configuration, the lock on its folder, checkpoints, and the state to resume from.
+
+Checkpoints and states survive a loss of power, and are checked before they are loaded. A state has
+the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
+process's random number generators, the learning curve, all counters, and the position of every
+environment in its episode. On a CPU, a resumed run therefore continues bit for bit, and repeats
+what came after the last save. If a worker process had failed when the state was saved, the episodes
+in progress are replaced by episodes of other seeds.
+"""
 
 from __future__ import annotations
 
+import fcntl
 import json
+import logging
 import math
+import os
+import shutil
+from collections.abc import Iterable, Mapping
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, get_args
 
 import torch
-from torchrl.checkpoint import CheckpointError, CheckpointRotation
+from torchrl.checkpoint import (
+    Checkpoint,
+    CheckpointAdapter,
+    CheckpointError,
+    CheckpointLoadResult,
+    CheckpointRotation,
+    GlobalRNGState,
+)
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner, Problem
 from ba_torchrl.core.config import Which
-from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import read_json, write_text
+from ba_torchrl.core.errors import ConfigError, DamagedFilesError
+from ba_torchrl.core.files import (
+    OLD,
+    RENAMED,
+    Lock,
+    check,
+    complete_only,
+    read_json,
+    read_state,
+    seal,
+    write_state,
+    write_text,
+)
 from ba_torchrl.core.plugins import check_known
 from ba_torchrl.envs.factory import make
-from ba_torchrl.record.results import CONFIG_FILE
+from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, differences
 from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.persistence import (
-    DurableCheckpoint,
-    first_sound,
-    remove_leftovers,
-    saved_steps,
-    step_of,
-)
+from ba_torchrl.training.state import RunState
 
+logger = logging.getLogger(__name__)
+
+LOCK_FILE = "run.lock"
+_CHECKPOINTS, _RESUME = "checkpoints", "resume"
 _VERSIONS = ("task_version", "expert_version")
 """Entries of a run's configuration file that are no settings."""
 
+# -- the run folder ----------------------------------------------------------------------------
 
-class Checkpoints:
-    """The checkpoints of a run folder: the latest ones and the best.
 
-    Each gets its final name when it is complete on the disk, with checksums of its files.
+def lock_run(folder: Path) -> Lock:
+    """Lock a run folder, which is created if needed.
+
+    Raises:
+        ConfigError: another process holds the lock; the message names it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    return Lock(folder / LOCK_FILE, f"runs the experiment in {folder}")
+
+
+def lock_holder(folder: Path) -> str | None:
+    """Return the process that runs the experiment in a folder, such as "process 12 on a-host".
+
+    None if there is none.
+    """
+    try:
+        with (folder / LOCK_FILE).open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return file.read() or "another process"
+    except FileNotFoundError:
+        pass
+    return None
+
+
+def open_run_folder(config: ExperimentConfig) -> None:
+    """Make the run folder and write the configuration into it.
+
+    Raises:
+        ConfigError: it holds a run that is finished, or that has other settings, or that
+            ``resume`` does not ask for; the message names the reason.
+    """
+    folder = config.folder
+    if (folder / CONFIG_FILE).exists():
+        if (folder / RESULT_FILE).exists():
+            raise ConfigError(f"{folder} holds a finished run; choose another run_dir")
+        if not config.resume:
+            raise ConfigError(
+                f"{folder} holds a run that did not finish: resume=true continues it, another "
+                "run_dir starts a new one"
+            )
+        check_same_run(config)
+        if resumable_updates(folder) is None:
+            if (folder / _CHECKPOINTS).exists():
+                raise ConfigError(
+                    f"{folder} has checkpoints, but nothing to resume from; choose another run_dir"
+                )
+            logger.warning("the run in %s has no saved state yet: starting it again", folder)
+    write_config(config)
+
+
+def check_same_run(
+    config: ExperimentConfig, started: ExperimentConfig | None = None, there: Versions | None = None
+) -> None:
+    """Check that the run in the folder of ``config`` has the same settings, task and expert.
+
+    The device may differ, and that of the folder need not exist on this machine.
 
     Args:
-        folder: the run folder.
-        algorithm: what to save.
-        keep_last: how many of the latest to keep.
+        config: of the run.
+        started: its configuration there; None to read it.
+        there: its versions; None to read them. An expert that is not known, or took no part, may
+            be any.
+
+    Raises:
+        ConfigError: it has not; the message names every difference.
     """
-
-    def __init__(self, folder: Path, algorithm: Learner, keep_last: int = 2) -> None:
-        self._folder = folder
-        self._checkpoint = DurableCheckpoint(algorithm=algorithm)
-        remove_leftovers(folder / "checkpoints")
-        self._rotation = _rotation(folder, keep_last)
-
-    def save(self, updates: int, success_rate: float) -> Path:
-        """Write a checkpoint and return its folder."""
-        metadata = {
-            "updates": updates,
-            "success_rate": success_rate,
-            "ba_torchrl": __version__,
-            "torch": torch.__version__,
-        }
-        return Path(self._rotation.save(self._checkpoint, step=updates, metadata=metadata))
-
-    def has(self, updates: int) -> bool:
-        """Whether there is a checkpoint of the policy after so many updates."""
-        return any(step_of(path) == updates for path in self._rotation.checkpoints())
-
-    def find(self, which: Which) -> Path:
-        """Return the folder of the latest or the best checkpoint; see `find_checkpoint`."""
-        return find_checkpoint(self._folder, which)
-
-    def load(self, path: Path) -> None:
-        """Put the algorithm into the state of a checkpoint."""
-        self._checkpoint.load(path)
+    started = started or read_config(config.folder, device=config.device)
+    found = differences(started.resolved(), config.resolved())
+    if found:
+        lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
+        raise ConfigError(
+            f"the run in {config.folder} was started with other settings; choose another folder:"
+            + "\n  ".join(["", *lines])
+        )
+    there, here = there or read_versions(config.folder), versions_of(config.task)
+    if there.task != here.task or there.expert not in (None, here.expert):
+        raise ConfigError(
+            f"the run in {config.folder} was started with {there} of {config.task}, here are "
+            f"{here}: choose another folder, or use the package that started it"
+        )
 
 
 def write_config(config: ExperimentConfig) -> None:
@@ -139,6 +215,166 @@ def parse_saved(saved: dict[str, Any], file: str | Path, **changes: Any) -> Expe
         raise ConfigError(f"this version cannot use {file}: {error}") from None
 
 
+# -- checkpoints -------------------------------------------------------------------------------
+
+
+class _StateAdapter(CheckpointAdapter):
+    """Writes a component's ``state_dict`` with `write_state`."""
+
+    adapter_id = "ba_torchrl.state.3"
+    # 1: weights of kernels whose signs depended on the CPU; 2: images under other keys
+
+    def save(self, component: Any, path: Path, **_: Any) -> None:
+        write_state(path, component.state_dict())
+
+    def load(self, component: Any, path: Path, **_: Any) -> None:
+        component.load_state_dict(read_state(path))
+
+
+class DurableCheckpoint(Checkpoint):
+    """TorchRL's checkpoint as a folder of data that appears when it is complete on the disk.
+
+    Args:
+        components: what is saved, by name: each has ``state_dict`` and ``load_state_dict``.
+    """
+
+    def __init__(self, **components: Any) -> None:
+        super().__init__()
+        for name, component in components.items():
+            self.register(name, component, adapter=_StateAdapter())
+
+    def save(self, path: str | Path, **options: Any) -> Path:
+        """Write a checkpoint; see TorchRL.
+
+        Raises:
+            OSError: there is not enough space.
+        """
+        path = Path(path)
+        with complete_only(path, replace=True) as scratch:
+            super().save(scratch, **options)
+            seal(scratch)
+        return path
+
+    def load(self, path: str | Path, **options: Any) -> CheckpointLoadResult:
+        """Check and load a checkpoint; see TorchRL.
+
+        Raises:
+            DamagedFilesError: a file is missing, altered or shorter than written.
+            ConfigError: a file is neither safetensors nor JSON, or its content does not fit the
+                components.
+        """
+        check(path)
+        try:
+            return super().load(path, **options)
+        except (CheckpointError, OSError, ValueError, KeyError, TypeError) as error:
+            reason = " ".join(str(error).split())
+            if "ba_torchrl.state.2" in reason:
+                reason = f"{RENAMED}; train again"
+            raise ConfigError(
+                f"{path} does not fit this version or configuration: {reason}"
+            ) from error
+
+    @classmethod
+    def manifest(cls, path: str | Path) -> dict[str, Any]:
+        """Read the manifest of a checkpoint; see TorchRL.
+
+        Raises:
+            CheckpointError: it is none.
+        """
+        try:
+            return super().manifest(path)
+        except AttributeError as error:  # TorchRL expects that the file holds a mapping
+            raise CheckpointError(f"{path}: the manifest is not a mapping") from error
+
+
+def saved_steps(folder: Path) -> list[Path]:
+    """Return the checkpoints in a folder of TorchRL's `CheckpointRotation`, the newest first.
+
+    Those that cannot be read are included.
+    """
+    found = (path for path in folder.glob("checkpoint-*") if step_of(path) is not None)
+    return sorted(found, key=step_of, reverse=True)
+
+
+def step_of(path: Path) -> int | None:
+    """Return the step of a checkpoint's folder, None if its name has none."""
+    step = path.name.removeprefix("checkpoint-")
+    return int(step) if step.isdigit() else None
+
+
+def remove_leftovers(folder: Path) -> None:
+    """Delete what an interrupted save left in a folder of checkpoints.
+
+    A checkpoint that was about to be replaced by one of the same step gets its name back.
+    """
+    for replaced in folder.glob(f".checkpoint-*{OLD}"):
+        checkpoint = folder / replaced.name.removeprefix(".").removesuffix(OLD)
+        if not checkpoint.exists():
+            os.replace(replaced, checkpoint)
+    for leftover in folder.glob(".checkpoint-*"):
+        if leftover.is_dir():
+            shutil.rmtree(leftover)
+        else:
+            leftover.unlink()
+
+
+def first_sound(paths: Iterable[Path]) -> Path | None:
+    """Return the first of some checkpoints whose files are whole, None if none is.
+
+    A warning names each one that is passed over.
+    """
+    for path in paths:
+        try:
+            check(path)
+        except DamagedFilesError as error:
+            logger.warning("%s: passed over for the one before: %s", path.name, error)
+        else:
+            return path
+    return None
+
+
+class Checkpoints:
+    """The checkpoints of a run folder: the latest ones and the best.
+
+    Each gets its final name when it is complete on the disk, with checksums of its files.
+
+    Args:
+        folder: the run folder.
+        algorithm: what to save.
+        keep_last: how many of the latest to keep.
+    """
+
+    def __init__(self, folder: Path, algorithm: Learner, keep_last: int = 2) -> None:
+        self._folder = folder
+        self._checkpoint = DurableCheckpoint(algorithm=algorithm)
+        remove_leftovers(folder / _CHECKPOINTS)
+        self._rotation = CheckpointRotation(
+            folder / _CHECKPOINTS, keep_last=keep_last, keep_best=("success_rate", "max")
+        )
+
+    def save(self, updates: int, success_rate: float) -> Path:
+        """Write a checkpoint and return its folder."""
+        metadata = {
+            "updates": updates,
+            "success_rate": success_rate,
+            "ba_torchrl": __version__,
+            "torch": torch.__version__,
+        }
+        return Path(self._rotation.save(self._checkpoint, step=updates, metadata=metadata))
+
+    def has(self, updates: int) -> bool:
+        """Whether there is a checkpoint of the policy after so many updates."""
+        return any(step_of(path) == updates for path in self._rotation.checkpoints())
+
+    def find(self, which: Which) -> Path:
+        """Return the folder of the latest or the best checkpoint; see `find_checkpoint`."""
+        return find_checkpoint(self._folder, which)
+
+    def load(self, path: Path) -> None:
+        """Put the algorithm into the state of a checkpoint."""
+        self._checkpoint.load(path)
+
+
 def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     """Return the folder of a checkpoint.
 
@@ -153,8 +389,8 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     if which not in get_args(Which):
         raise ConfigError(f"which: {which!r} is none of {', '.join(get_args(Which))}")
     path = Path(path)
-    if (path / "checkpoints").is_dir():
-        saved = saved_steps(path / "checkpoints")
+    if (path / _CHECKPOINTS).is_dir():
+        saved = saved_steps(path / _CHECKPOINTS)
         if which == "best":  # the newest of equal ones
             saved = sorted(saved, key=_success_rate, reverse=True)
         found = first_sound(saved)
@@ -162,12 +398,23 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
             return found
         if saved:
             raise ConfigError(f"all checkpoints of {path} are damaged; see the warnings above")
-    if path.parent.name == "checkpoints" and path.exists():
+    if path.parent.name == _CHECKPOINTS and path.exists():
         return path
     raise ConfigError(
         f"{path} is neither a run folder with checkpoints nor one of its checkpoints; "
         "a run folder holds config.json and checkpoints/"
     )
+
+
+def _success_rate(checkpoint: Path) -> float:
+    """Return the success rate of a checkpoint, infinity if it cannot be read.
+
+    It is then examined first, and the warning names it.
+    """
+    try:
+        return float(DurableCheckpoint.manifest(checkpoint)["metadata"]["success_rate"])
+    except (CheckpointError, OSError, ValueError, KeyError, TypeError):
+        return math.inf
 
 
 def load(
@@ -233,18 +480,78 @@ def problem_of(config: ExperimentConfig) -> Problem:
     )
 
 
-def _success_rate(checkpoint: Path) -> float:
-    """Return the success rate of a checkpoint, infinity if it cannot be read.
+# -- the state to resume from ------------------------------------------------------------------
 
-    It is then examined first, and the warning names it.
+
+class ResumeState:
+    """The state that a run saves regularly and deletes when it finishes; it is large.
+
+    Each state gets its final name when it is complete on the disk, with checksums of its files. The
+    last two are kept: if the newest is damaged, the run continues from the one before.
+
+    Args:
+        folder: the run folder.
+        algorithm: whose state and replay are saved.
+        state: the run's counters and curve.
     """
-    try:
-        return float(DurableCheckpoint.manifest(checkpoint)["metadata"]["success_rate"])
-    except (CheckpointError, OSError, ValueError, KeyError, TypeError):
-        return math.inf
+
+    def __init__(self, folder: Path, algorithm: Learner, state: RunState) -> None:
+        self._folder = folder / _RESUME
+        self._checkpoint = DurableCheckpoint(
+            algorithm=algorithm,
+            replay=SimpleNamespace(
+                state_dict=algorithm.replay_state, load_state_dict=algorithm.load_replay_state
+            ),
+            progress=state,
+            generators=_Generators(),
+        )
+        self._rotation = CheckpointRotation(self._folder, keep_last=2)
+
+    def save(self, updates: int) -> None:
+        """Write the state of a run after so many updates."""
+        self._rotation.save(self._checkpoint, step=updates)
+
+    def load(self) -> bool:
+        """Restore the newest state whose files are whole; return whether there is any state.
+
+        Raises:
+            ConfigError: all states are damaged, or hold files that are not plain data.
+        """
+        remove_leftovers(self._folder)
+        states = saved_steps(self._folder)
+        if not states:
+            return False
+        sound = first_sound(states)
+        if sound is None:
+            raise ConfigError(
+                f"all states in {self._folder} are damaged: start the run again in another "
+                "run_dir, or evaluate its checkpoints"
+            )
+        self._checkpoint.load(sound)
+        for damaged in states[: states.index(sound)]:
+            shutil.rmtree(damaged)
+        return True
+
+    def remove(self) -> None:
+        """Delete the state of a finished run."""
+        shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def _rotation(folder: Path, keep_last: int) -> CheckpointRotation:
-    return CheckpointRotation(
-        folder / "checkpoints", keep_last=keep_last, keep_best=("success_rate", "max")
-    )
+def resumable_updates(folder: str | Path) -> int | None:
+    """Return the update after which the run in a folder can be resumed, None if it cannot."""
+    states = saved_steps(Path(folder) / _RESUME)
+    return step_of(states[0]) if states else None
+
+
+class _Generators(GlobalRNGState):
+    """The process's generators; those of a GPU are restored only where there are as many GPUs."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
+        here = self.state_dict()
+        found = {name: value for name, value in state_dict.items() if name in here}
+        cuda = "torch_cuda"
+        if cuda in found and len(found[cuda]) != len(here[cuda]):
+            del found[cuda]
+        if len(found) < len(state_dict):
+            logger.warning("another device: %s not restored", ", ".join(state_dict.keys() - found))
+        super().load_state_dict(found)

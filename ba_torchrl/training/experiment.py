@@ -18,8 +18,15 @@ from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.core import keys
 from ba_torchrl.demonstrations.episodes import mean_length, success_rate
 from ba_torchrl.record.logging import ScalarLog, progress_bar
-from ba_torchrl.record.results import CurvePoint, Phase, TestedPolicy
-from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm
+from ba_torchrl.record.results import CurvePoint, TestedPolicy
+from ba_torchrl.training.checkpoint import (
+    Checkpoints,
+    ResumeState,
+    build_algorithm,
+    lock_run,
+    open_run_folder,
+    resumable_updates,
+)
 from ba_torchrl.training.collection import gather_demonstrations, make_env, start_collection
 from ba_torchrl.training.collectors.base import Collection
 from ba_torchrl.training.config import ExperimentConfig
@@ -33,10 +40,9 @@ from ba_torchrl.training.outputs import (
     record_video,
     write_record,
 )
-from ba_torchrl.training.persistence import RunLock
 from ba_torchrl.training.precision import compute_path, precision
 from ba_torchrl.training.protocol import run_test
-from ba_torchrl.training.resume import Progress, ResumeState, open_run_folder
+from ba_torchrl.training.state import RunState
 
 logger = logging.getLogger(__name__)
 
@@ -50,7 +56,7 @@ class Experiment:
 
     Args:
         config: the run. With ``resume`` an interrupted run continues from the last saved state; see
-            `ba_torchrl.training.resume`.
+            `ba_torchrl.training.checkpoint`.
         progress: show a progress bar.
 
     Raises:
@@ -60,7 +66,6 @@ class Experiment:
 
     def __init__(self, config: ExperimentConfig, progress: bool = True) -> None:
         self.config = config
-        self.progress = progress
         if config.threads is not None:
             torch.set_num_threads(config.threads)
         check_packages(config)
@@ -70,25 +75,23 @@ class Experiment:
         self.algorithm = build_algorithm(config)
         if config.compile_mode is not None:
             self.algorithm.compile(config.compile_mode)
-        self._lock = RunLock(config.folder)
+        self._lock = lock_run(config.folder)
         open_run_folder(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
         self.checkpoints = Checkpoints(config.folder, self.algorithm)
         self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
         self._collection: Collection | None = None
         self._eval_env: EnvBase | None = None
-        self._progress = Progress()
-        self._state = ResumeState(config.folder, self.algorithm, self._progress)
+        self.state = RunState()
+        self._resume_state = ResumeState(config.folder, self.algorithm, self.state)
         self._update_times: list[float] = []
         """Seconds of collection and updates after each of the first updates of a phase."""
-        self._seconds_per_update: float | None = None
         self._phase_name = ""
         self._signals = StopSignals()
-        self._is_between_updates = False
-        """Whether the state can be saved: there is one, and no update is under way."""
-        self._is_reporting = False
-        """Whether the networks may be those of an earlier update; the last state is saved then."""
-        self._last_time = self._last_save = time.perf_counter()
+        self._can_save = False
+        """Whether there is a state that can be saved: no update is under way, and the networks are
+        those of the last one."""
+        self._last_save = time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
     def run(self) -> Result:
@@ -97,7 +100,7 @@ class Experiment:
         Raises:
             RunStopped: SIGINT or SIGTERM was received, and the state is saved.
         """
-        self._last_time = self._last_save = time.perf_counter()
+        self.state.last_time = self._last_save = time.perf_counter()
         for message in self.config.without_effect():
             logger.warning(message)
         with self._signals:  # which last until the state is saved
@@ -135,13 +138,13 @@ class Experiment:
 
     def _resume(self) -> bool:
         """Restore the last saved state; return whether there is one."""
-        if not self._state.load():
+        if not self._resume_state.load():
             return False
-        self._is_between_updates = True
-        updates, progress = self.algorithm.updates, self._progress
-        progress.resumed_at.append(updates)
+        self._can_save = True
+        updates, state = self.algorithm.updates, self.state
+        state.resumed_at.append(updates)
         self._bar.update(updates)
-        last = progress.curve[-1] if progress.curve else None
+        last = state.curve[-1] if state.curve else None
         if last and 0 < last.updates == updates and not self.checkpoints.has(updates):
             self.checkpoints.save(updates, last.success_rate)  # interrupted between the two
         logger.info("the run in %s continues after update %d", self.config.folder, updates)
@@ -149,19 +152,19 @@ class Experiment:
 
     def _demonstrate(self) -> None:
         """Fill the replay with demonstrations."""
-        self._progress.expert_version = expert_version(self.config)
+        self.state.expert_version = expert_version(self.config)
         if self.config.demonstrations:
             self._store_demonstrations()
-        self._is_between_updates = True
+        self._can_save = True
 
     def _store_demonstrations(self) -> None:
-        with self._phase("demonstrations"), self._timed("demonstrations"):
+        with self._phase("demonstrations"), self.state.timed("demonstrations"):
             episodes = gather_demonstrations(
                 self.config, self.algorithm, lambda _: self._signals.check()
             )
             self.algorithm.on_demonstrations(episodes)
-        self._progress.demonstrations = len(episodes)
-        self._progress.demonstration_steps = sum(map(len, episodes))
+        self.state.demonstrations = len(episodes)
+        self.state.demonstration_steps = sum(map(len, episodes))
         self.log.write(
             0,
             {
@@ -174,8 +177,8 @@ class Experiment:
         """Pretrain, then alternate collection and updates until the last update."""
         config, algorithm = self.config, self.algorithm
         computed = precision(config)
-        if computed not in self._progress.precisions:
-            self._progress.precisions.append(computed)
+        if computed not in self.state.precisions:
+            self.state.precisions.append(computed)
         collects = config.algorithm_config.collects
         pretrain_updates = config.pretrain_updates if collects else config.total_updates
         with self._phase("pretraining"):
@@ -183,31 +186,31 @@ class Experiment:
                 self._update(algorithm.pretrain_update)
         if self._is_complete:
             return
-        with self._timed("collection"):
+        with self.state.timed("collection"):
             self._collection = self._start_collection()
         self._update_times.clear()  # collection between updates takes time
         with self._phase("training"):
             while not self._take_pending_updates():
-                with self._timed("collection"):
+                with self.state.timed("collection"):
                     steps = self._store(next(self._collection))
                 if algorithm.replay_size >= config.min_replay:
-                    self._progress.pending_updates = steps * config.updates_per_step
+                    self.state.pending_updates = steps * config.updates_per_step
                 self._stop_or_save()
         if algorithm.updates < config.total_updates:
             logger.info("the run ends at update %d: stop_at_success", algorithm.updates)
 
     def _start_collection(self) -> Collection:
         """Start to collect, and continue the episodes of a resumed run."""
-        config, progress = self.config, self._progress
+        config, state = self.config, self.state
         # Without positions, a resumed run plays other episodes than before its interruption.
-        part = progress.resumed_at[-1] if progress.env_steps and progress.resumed_at else 0
+        part = state.resumed_at[-1] if state.env_steps and state.resumed_at else 0
         seed = config.derived_seed(SeedUse.COLLECTION, part)
-        return start_collection(config, self.algorithm, seed, progress.positions)
+        return start_collection(config, self.algorithm, seed, state.positions)
 
     def _take_pending_updates(self) -> bool:
         """Take the updates of the last step of collection; return whether the run is complete."""
-        while self._progress.pending_updates and not self._is_complete:
-            self._progress.pending_updates -= 1
+        while self.state.pending_updates and not self._is_complete:
+            self.state.pending_updates -= 1
             self._update(self.algorithm.update)
         return self._is_complete
 
@@ -217,18 +220,18 @@ class Experiment:
         if self.algorithm.updates == self.config.total_updates:
             return True
         target = self.config.stop_at_success
-        last = [point for point in self._progress.curve[-2:] if point.updates]
+        last = [point for point in self.state.curve[-2:] if point.updates]
         if target is None or len(last) < 2:
             return False
         return all(point.success_rate >= target for point in last)
 
     def _finish(self) -> Result:
         """Test the last policy and the best checkpoint; write curve, video and record."""
-        config, progress = self.config, self._progress
-        if not progress.curve or progress.curve[-1].updates < self.algorithm.updates:
+        config, state = self.config, self.state
+        if not state.curve or state.curve[-1].updates < self.algorithm.updates:
             self._evaluate_and_save()
         latest, best_checkpoint = (self.checkpoints.find(which) for which in ("latest", "best"))
-        self._is_reporting = True
+        self._can_save = False
         last = best = self._test()
         with self._phase("video"):
             video = record_video(config, self._greedy)
@@ -238,11 +241,11 @@ class Experiment:
             self.checkpoints.load(latest)
         rates = {"final/success_rate": last.success_rate, "final/mean_length": last.mean_length}
         self.log.write(last.updates, {**rates, "final/best_success_rate": best.success_rate})
-        curve = plot_curve(config, progress.curve)
-        seconds = self._total_seconds()
+        curve = plot_curve(config, state.curve)
+        seconds = self.state.total_seconds()
         files = {"curve": curve, "checkpoint": latest, "best": best_checkpoint, "video": video}
-        record = write_record(config, self.algorithm, last, best, progress, files)
-        self._state.remove()
+        record = write_record(config, self.algorithm, last, best, state, files)
+        self._resume_state.remove()
         return Result(last, best, latest, curve, video, record, seconds)
 
     # -- parts -------------------------------------------------------------------------------
@@ -259,49 +262,30 @@ class Experiment:
             self._phase_name = before
             self._bar.set_description(before, refresh=shows)
 
-    @contextmanager
-    def _timed(self, phase: Phase) -> Iterator[None]:
-        """Context whose time is that of a phase; the time between such contexts is "other"."""
-        self._add_time("other")
-        try:
-            yield
-        finally:
-            self._add_time(phase)
-
-    def _add_time(self, phase: Phase) -> None:
-        """Add the time since the last call to a phase."""
-        last, self._last_time = self._last_time, time.perf_counter()
-        self._progress.phase_seconds[phase] += self._last_time - last
-
-    def _total_seconds(self) -> float:
-        """Return the time of all phases until now."""
-        self._add_time("other")
-        return sum(self._progress.phase_seconds.values())
-
     def _store(self, data: TensorDict) -> int:
         """Add collected transitions to the replay and count steps, faults and successes.
 
         Returns:
             The number of steps of all environments together that were completed.
         """
-        progress, following = self._progress, data[keys.NEXT]
-        steps_before = progress.env_steps // self.config.num_envs
+        state, following = self.state, data[keys.NEXT]
+        steps_before = state.env_steps // self.config.num_envs
         is_present = ~data[keys.FAULT]  # not so while the worker of an environment starts
-        progress.env_steps += int(is_present.sum())
-        progress.faults += int((following[keys.FAULT] & is_present).sum())
+        state.env_steps += int(is_present.sum())
+        state.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
-        progress.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
+        state.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
         if self.algorithm.config.imitates == "expert_everywhere":
-            progress.expert_labels += int((is_present & ~following[keys.FAULT]).sum())
+            state.expert_labels += int((is_present & ~following[keys.FAULT]).sum())
         self.algorithm.extend(self.algorithm.to_transitions(data, is_demonstration=False))
-        return progress.env_steps // self.config.num_envs - steps_before
+        return state.env_steps // self.config.num_envs - steps_before
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:
         """Take one update; log and evaluate if they are due."""
-        self._is_between_updates = False
-        with self._timed("updates"):
+        self._can_save = False
+        with self.state.timed("updates"):
             scalars = take_update()
-        self._is_between_updates = True
+        self._can_save = True
         updates = self.algorithm.updates
         self._bar.update()
         self._log_duration()
@@ -319,24 +303,31 @@ class Experiment:
         found = [value.reshape(()).float() for value in scalars.values()]
         # in one copy, since each copy from a GPU waits for it
         values = dict(zip(names, torch.stack(found).tolist(), strict=True)) if found else {}
-        progress = self._progress
-        values |= {"train/env_steps": progress.env_steps, "train/faults": progress.faults}
+        state = self.state
+        values |= {"train/env_steps": state.env_steps, "train/faults": state.faults}
         collector = {} if self._collection is None else self._collection.scalars
         values |= {f"collector/{key}": value for key, value in collector.items()}
-        if progress.recent:
-            values["train/success_rate"] = sum(progress.recent) / len(progress.recent)
+        if state.recent:
+            values["train/success_rate"] = sum(state.recent) / len(state.recent)
         self.log.write(self.algorithm.updates, values)
+
+    @property
+    def _seconds_per_update(self) -> float | None:
+        """Mean over the first updates of a phase, without the very first; None until then."""
+        times = self._update_times
+        if len(times) < WARM_UP_UPDATES + MEASURED_UPDATES:
+            return None
+        return (times[-1] - times[WARM_UP_UPDATES - 1]) / MEASURED_UPDATES
 
     def _log_duration(self) -> None:
         """Log the expected duration of the remaining updates after the first ones of a phase."""
-        times, seconds = self._update_times, self._progress.phase_seconds
+        times, seconds = self._update_times, self.state.phase_seconds
         if len(times) == WARM_UP_UPDATES + MEASURED_UPDATES:
             return
         times.append(seconds["updates"] + seconds["collection"])
         if len(times) < WARM_UP_UPDATES + MEASURED_UPDATES:
             return
-        seconds_per_update = (times[-1] - times[WARM_UP_UPDATES - 1]) / MEASURED_UPDATES
-        self._seconds_per_update = seconds_per_update
+        seconds_per_update = self._seconds_per_update
         target = self.config.stop_at_success
         remaining = self.config.total_updates - self.algorithm.updates
         logger.info(
@@ -351,7 +342,7 @@ class Experiment:
 
     def _evaluate_if_due(self) -> None:
         """Evaluate at 0 and every multiple of ``eval_every``, except at the end of the run."""
-        updates, curve = self.algorithm.updates, self._progress.curve
+        updates, curve = self.algorithm.updates, self.state.curve
         is_new = not curve or updates > curve[-1].updates
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
             self._evaluate_and_save()
@@ -359,10 +350,10 @@ class Experiment:
 
     def _log_end(self) -> None:
         """Log the expected duration of the rest of the run after two evaluations in training."""
-        config, updates, progress = self.config, self.algorithm.updates, self._progress
-        if self._seconds_per_update is None or len(progress.curve) > 3:
+        config, updates, state = self.config, self.algorithm.updates, self.state
+        if self._seconds_per_update is None or len(state.curve) > 3:
             return
-        seconds_per_evaluation = progress.phase_seconds["evaluation"] / len(progress.curve)
+        seconds_per_evaluation = state.phase_seconds["evaluation"] / len(state.curve)
         remaining = config.total_updates - updates
         last = 2 * config.final_eval_episodes / config.eval_episodes
         evaluations = remaining // config.eval_every + last
@@ -377,40 +368,38 @@ class Experiment:
 
     def _save(self) -> None:
         """Save the state, with the positions of the environments in their episodes."""
-        self._add_time("other")
+        self.state.add_time("other")
         if self._collection is not None:
-            self._progress.positions = self._collection.get_positions()
-        self._state.save(self.algorithm.updates)
+            self.state.positions = self._collection.get_positions()
+        self._resume_state.save(self.algorithm.updates)
         self._last_save = time.perf_counter()
 
     def _save_if_possible(self) -> bool:
-        """Save the state of a run that ends early; return whether it could be saved."""
-        if self._is_reporting:
-            return True
-        if not self._is_between_updates:
-            return False
+        """Save the state of a run that ends early, if that is possible; return whether the last
+        one is saved."""
         try:
-            self._save()
+            if self._can_save:
+                self._save()
         except OSError as error:  # the disk is full, for example; the state before is whole
             logger.error("the state could not be saved: %s", error)
             return False
-        return True
+        return resumable_updates(self.config.folder) is not None
 
     def _evaluate_and_save(self) -> None:
         """Add a point to the learning curve; save the state and, of a trained policy, a checkpoint.
 
         The untrained policy has the episodes of the first trained one.
         """
-        updates, progress = self.algorithm.updates, self._progress
+        updates, state = self.algorithm.updates, self.state
         # A run must not end because the same episodes succeed twice.
-        trained = [point for point in progress.curve if point.updates]
+        trained = [point for point in state.curve if point.updates]
         part = 0 if self.config.stop_at_success is None else len(trained)
         evaluation = self._evaluate(part)
-        progress.curve.append(
+        state.curve.append(
             CurvePoint(
                 updates=updates,
-                env_steps=progress.env_steps,
-                seconds=self._total_seconds(),
+                env_steps=state.env_steps,
+                seconds=self.state.total_seconds(),
                 **asdict(evaluation),
             )
         )
@@ -436,7 +425,7 @@ class Experiment:
     @contextmanager
     def _evaluating(self) -> Iterator[EnvBase]:
         """Context of the phase of evaluations, with their environments."""
-        with self._phase("evaluation"), self._timed("evaluation"):
+        with self._phase("evaluation"), self.state.timed("evaluation"):
             if self._eval_env is None:
                 seed = self.config.derived_seed(SeedUse.EVALUATION)
                 self._eval_env = make_env(self.config, seed)

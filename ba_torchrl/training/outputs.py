@@ -25,7 +25,7 @@ from ba_torchrl.record.video import write_video
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import record_episodes
 from ba_torchrl.training.protocol import PROTOCOL, count_parameters, test_seed
-from ba_torchrl.training.resume import Progress
+from ba_torchrl.training.state import RunState
 
 
 @dataclass(frozen=True)
@@ -93,7 +93,7 @@ def write_record(
     algorithm: Learner,
     last: TestedPolicy,
     best: TestedPolicy,
-    progress: Progress,
+    state: RunState,
     files: dict[str, Path | None],
 ) -> Path:
     """Write the run's result as JSON; return the file.
@@ -103,7 +103,7 @@ def write_record(
         algorithm: whose policy was tested.
         last: test of the policy that training ended with.
         best: test of the checkpoint with the best evaluation.
-        progress: learning curve, counts and times.
+        state: learning curve, counts and times.
         files: the run's other files by name; None for one that was not written.
     """
     folder, task = config.folder.resolve(), config.resolved_env.task_class
@@ -113,25 +113,25 @@ def write_record(
             protocol=PROTOCOL,
             task=config.task,
             task_version=task.version,
-            expert_version=progress.expert_version,
+            expert_version=state.expert_version,
             label=config.label,
             benchmark=config.benchmark,
             seed=config.seed,
-            curve=progress.curve,
+            curve=state.curve,
             last=last,
             best=best,
-            demonstrations=progress.demonstrations,
-            demonstration_steps=progress.demonstration_steps,
-            env_steps=progress.env_steps,
-            expert_labels=progress.expert_labels,
-            precision=", then ".join(progress.precisions),
+            demonstrations=state.demonstrations,
+            demonstration_steps=state.demonstration_steps,
+            env_steps=state.env_steps,
+            expert_labels=state.expert_labels,
+            precision=", then ".join(state.precisions),
             parameters=count_parameters(algorithm.policy),
             config=config.resolved(),
             versions=versions(),
             hardware=hardware(config.torch_device),
-            seconds=sum(progress.phase_seconds.values()),
-            phase_seconds=progress.phase_seconds,
-            resumed_at=progress.resumed_at,
+            seconds=sum(state.phase_seconds.values()),
+            phase_seconds=state.phase_seconds,
+            resumed_at=state.resumed_at,
             finished=now(),
             files={
                 name: path.resolve().relative_to(folder).as_posix()

@@ -73,7 +73,7 @@ def test_a_run_stores_whole_episodes(tmp_path, collector):
     experiment = make_experiment(tmp_path, "cnn", algorithm, **settings)
     experiment.run()
     learner = experiment.algorithm
-    env_steps = experiment._progress.env_steps
+    env_steps = experiment.state.env_steps
     ended = learner.replay.storage.column((keys.NEXT, keys.DONE)).flatten()
     is_demonstration = learner.replay.storage.column(keys.IS_DEMONSTRATION).flatten()
     successful = learner.replay.storage.column((keys.NEXT, keys.REWARD)).flatten() > 0

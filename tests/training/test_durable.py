@@ -17,11 +17,15 @@ from ba_torchrl.core.files import CHECKSUMS_FILE, fingerprint, seal
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.results import read_failure, read_result
-from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
+from ba_torchrl.training.checkpoint import (
+    find_checkpoint,
+    load,
+    read_config,
+    remove_leftovers,
+    resumable_updates,
+)
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
-from ba_torchrl.training.persistence import remove_leftovers
-from ba_torchrl.training.resume import resumable_updates
 from tests.planted import Planted
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
@@ -167,7 +171,7 @@ def test_no_file_of_a_state_runs_code(run, tmp_path):
     def open_state():
         experiment = Experiment(config_for(only, resume=True), progress=False)
         try:
-            experiment._state.load()
+            experiment._resume_state.load()
         finally:
             experiment.close()
             if not state.exists():

@@ -13,12 +13,10 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training import collection
 from ba_torchrl.training import experiment as experiments
-from ba_torchrl.training.checkpoint import Checkpoints
+from ba_torchrl.training.checkpoint import Checkpoints, lock_holder, resumable_updates, saved_steps
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
-from ba_torchrl.training.persistence import lock_holder, saved_steps
-from ba_torchrl.training.resume import resumable_updates
 from tests.tasks.episodes import slow
 
 SAC = {
@@ -179,7 +177,7 @@ def test_a_run_stopped_in_an_evaluation_repeats_it(tmp_path, undisturbed, evalua
     with pytest.raises(RunStopped):
         experiment.run()
     assert resumable_updates(tmp_path) == 8 * (evaluation - 1)
-    assert len(experiment._progress.curve) == evaluation - 1
+    assert len(experiment.state.curve) == evaluation - 1
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
@@ -195,8 +193,8 @@ def test_a_run_stopped_in_its_tests_keeps_the_last_state(tmp_path, number, monke
     experiment = Experiment(config_for(tmp_path / "run"), progress=False)
     at_call(experiment, experiment, "_test", number, terminate)
     saved = []
-    save = experiment._state.save
-    experiment._state.save = lambda updates: (saved.append(updates), save(updates))
+    save = experiment._resume_state.save
+    experiment._resume_state.save = lambda updates: (saved.append(updates), save(updates))
     with pytest.raises(RunStopped, match="state saved"):
         experiment.run()
     assert saved == [0, 8, 16, 21]
@@ -230,7 +228,9 @@ def test_open_loop_in_worker_processes_continues_with_the_same_bits(tmp_path):
 def test_repeated_signals_do_not_interrupt_the_save(tmp_path, undisturbed):
     experiment = Experiment(config_for(tmp_path), progress=False)
     at_call(experiment, experiment.algorithm, "update", 9, terminate)
-    at_call(experiment, experiment._state, "save", 2, terminate)  # the first is at an evaluation
+    at_call(
+        experiment, experiment._resume_state, "save", 2, terminate
+    )  # the first is at an evaluation
     with pytest.raises(RunStopped, match="state saved"):
         experiment.run()
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)

@@ -21,10 +21,10 @@ def test_the_first_updates_and_evaluations_are_not_measured(tmp_path, monkeypatc
     with Experiment(tiny(tmp_path), progress=False) as run:
         for count in range(WARM_UP_UPDATES + MEASURED_UPDATES):
             assert run._seconds_per_update is None
-            with run._timed("updates"):
+            with run.state.timed("updates"):
                 now[0] += 100.0 if count < WARM_UP_UPDATES else 0.5
             run._log_duration()
-            with run._timed("evaluation"):
+            with run.state.timed("evaluation"):
                 now[0] += 50.0
     assert run._seconds_per_update == pytest.approx(0.5)
 

@@ -10,10 +10,15 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import experiment as experiments
-from ba_torchrl.training.checkpoint import find_checkpoint, load, read_config
+from ba_torchrl.training.checkpoint import (
+    check_same_run,
+    find_checkpoint,
+    load,
+    read_config,
+    resumable_updates,
+)
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
-from ba_torchrl.training.resume import check_same_run, resumable_updates
 
 TINY = {
     "task": "close_loop/block_reaching",
@@ -196,7 +201,7 @@ def test_a_crash_while_saving_keeps_the_last_state(tmp_path):
     shutil.copytree(state, state.with_name(f".{state.name}.stage-0123"))
     assert resumable_updates(config.folder) == 3
     again = resumed(config)
-    assert [point.updates for point in again._progress.curve] == [0, 3]
+    assert [point.updates for point in again.state.curve] == [0, 3]
     assert sorted((config.folder / "resume").iterdir()) == states
 
 

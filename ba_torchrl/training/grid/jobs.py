@@ -22,9 +22,9 @@ from tqdm import tqdm
 from ba_torchrl.core.files import write_text
 from ba_torchrl.record.logging import FILE_INTERVAL_S, last_step
 from ba_torchrl.record.results import FAILURE_FILE, now
+from ba_torchrl.training.checkpoint import lock_holder
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import status
-from ba_torchrl.training.persistence import lock_holder
 
 LOG_FILE = "run.log"
 LOG_LINES = 20

@@ -19,7 +19,6 @@ from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
     RESULT_FILE,
-    differences,
     read_failure,
     read_result,
 )
@@ -213,9 +212,13 @@ def status(run: ExperimentConfig) -> Status:
     Raises:
         ConfigError: its folder holds a run with other settings.
     """
-    from ba_torchrl.training.checkpoint import parse_saved, read_config
-    from ba_torchrl.training.persistence import lock_holder
-    from ba_torchrl.training.resume import check_same_run, check_same_versions, resumable_updates
+    from ba_torchrl.training.checkpoint import (
+        check_same_run,
+        lock_holder,
+        parse_saved,
+        read_config,
+        resumable_updates,
+    )
 
     folder = run.folder
     if (folder / RESULT_FILE).exists():
@@ -225,21 +228,14 @@ def status(run: ExperimentConfig) -> Status:
             return Status("failed", f"{error}; delete the folder to start the run again")
         # settings that are newer than the run have their defaults
         started = parse_saved(result.config, folder / RESULT_FILE, device=run.device)
-        found = differences(started.resolved(), run.resolved())
-        if found:
-            lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
-            raise ConfigError(
-                f"{folder} holds a run with other settings; choose another folder:\n  "
-                + "\n  ".join(lines)
-            )
-        check_same_versions(run, Versions(result.task_version, result.expert_version))
+        check_same_run(run, started, Versions(result.task_version, result.expert_version))
         return Status("done", f"success {result.last.success_rate:.2f}")
     if (folder / CONFIG_FILE).exists():
         try:
-            read_config(folder, device=run.device)
+            started = read_config(folder, device=run.device)
         except ConfigError as error:
             return Status("failed", f"{error}; delete the folder to start the run again")
-        check_same_run(run)
+        check_same_run(run, started)
     holder = lock_holder(folder)
     if holder is not None:
         return Status("running", holder)

@@ -73,7 +73,7 @@ def test_a_run_on_a_cluster_ends_like_every_run(tmp_path):
         experiment = Experiment(config_for(tmp_path, OPTIONS), progress=False)
         result = experiment.run()
         assert result.updates == 12
-        steps = experiment._progress.env_steps
+        steps = experiment.state.env_steps
         assert 4 * 12 <= steps <= 4 * 12 + 4
         is_demonstration = experiment.algorithm.replay.storage.column("is_demonstration")
         assert experiment.algorithm.replay_size == int(is_demonstration.sum()) + steps

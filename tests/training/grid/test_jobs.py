@@ -15,11 +15,11 @@ import pytest
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.checkpoint import lock_run
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.launchers import local
 from ba_torchrl.training.grid.plan import status
-from ba_torchrl.training.persistence import RunLock
 from tests.recipes import recipe
 from tests.record.test_report import write
 from tests.training.grid.grids import COMMON, REACH, planned
@@ -253,7 +253,7 @@ def test_a_run_that_another_process_starts_meanwhile_is_left_to_it(
     runs, sleep, locks = planned(tmp_path), time.sleep, []
 
     def start(seconds):
-        locks.append(locks[0] if locks else RunLock(runs[1].folder))
+        locks.append(locks[0] if locks else lock_run(runs[1].folder))
         sleep(seconds)
 
     with monkeypatch.context() as patch:
@@ -269,7 +269,7 @@ def test_a_run_that_another_process_starts_meanwhile_is_left_to_it(
 
 def test_a_run_that_still_works_is_skipped_by_the_name_of_its_process(tmp_path, fake, capsys):
     runs = planned(tmp_path)
-    lock = RunLock(runs[0].folder)
+    lock = lock_run(runs[0].folder)
     assert str(status(runs[0])).startswith(f"running: process {os.getpid()} on ")
     assert fake(runs) == {}
     assert f"skipped: process {os.getpid()} on " in capsys.readouterr().out

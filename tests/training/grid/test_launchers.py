@@ -9,11 +9,11 @@ import pytest
 from ba_torchrl.core.config import parse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import read_result
+from ba_torchrl.training.checkpoint import resumable_updates
 from ba_torchrl.training.grid.launchers import ray as ray_launcher
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 from ba_torchrl.training.grid.plan import status
 from ba_torchrl.training.interruption import Interruption, StopSignals
-from ba_torchrl.training.resume import resumable_updates
 from tests.training.grid.grids import planned
 from tests.training.ray_nodes import ray_nodes
 
