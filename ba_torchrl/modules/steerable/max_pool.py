@@ -1,4 +1,9 @@
-"""Max pooling followed by ReLU, in one pass over the memory on the CPU."""
+"""Max pooling followed by ReLU, in one pass over the memory on the CPU.
+
+With PyTorch's functions instead, an update of SAC takes 1.28 times (Equi of 16 fields, 64 px) and
+1.14 times (64 fields, 128 px) the CPU time: medians of 12 and 4 pairs, batch 64, one thread of a
+loaded AMD EPYC, oneDNN, ATen and Numba limited to AVX2.
+"""
 
 from __future__ import annotations
 
