@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from PIL import Image, ImageDraw
@@ -25,15 +25,16 @@ from ba_torchrl.cli.types import (
     PluginSettings,
     PngFile,
     Seed,
-    Structures,
     Tasks,
     check_untracked,
+    checked,
 )
 from ba_torchrl.core import keys
 from ba_torchrl.core.files import replaced
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs.description import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
+from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
 CELL, TITLE, HEADING, SPACE = 194, 36, 60, 18
 """Width of an image, height of a title above images and of a heading above a group of tasks, and
@@ -49,7 +50,9 @@ class Settings(PluginSettings):
 
     tasks: Tasks = None
     """Ids of tasks; null for all."""
-    deconstructions: Structures = Field(["open_loop/house_building_4"])
+    deconstructions: list[Annotated[str, checked(check_has_structure)]] = Field(
+        ["open_loop/house_building_4"]
+    )
     """Structures whose deconstruction is drawn."""
     seed: Seed = 5
     """Of the episodes."""

@@ -55,11 +55,7 @@ def ends_with_reader() -> Iterator[None]:
 
 @ends_with_reader()
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run the command that a command line names.
-
-    Args:
-        arguments: of the command line, without the program; those of this process if None.
-    """
+    """Run the command that a command line names."""
     first, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
     if first in ("--help", "-h", "help") and rest:
         first, rest = rest[0], ["--help", *rest[1:]]

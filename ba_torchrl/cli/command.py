@@ -83,11 +83,7 @@ class Command:
 
     @plain_errors
     def run(self, words: Sequence[str] | None = None) -> None:
-        """Run the command; an error in its arguments is one line, and ends the process.
-
-        Args:
-            words: of the command line, after the command's name; those of this process if None.
-        """
+        """Run the command; an error in its arguments is one line, and ends the process."""
         words = sys.argv[1:] if words is None else words
         arguments = self.read(words)
         if self.config is None:
@@ -130,11 +126,7 @@ class Command:
         return describe(usage, text, self.settings, values, self.config_names(), with_choices)
 
     def config_names(self, further: str | None = None) -> list[str]:
-        """Return the names that ``--config-name`` takes.
-
-        Args:
-            further: a folder besides that of the package.
-        """
+        """Return the names that ``--config-name`` takes."""
         if self.config is None:
             return []
         files = [*config_dir().glob(f"{self.variants}.yaml")]
@@ -142,11 +134,7 @@ class Command:
         return sorted({self.config, *(file.stem for file in files)})
 
     def read(self, words: Sequence[str]) -> Arguments:
-        """Return the parts of a command line.
-
-        Raises:
-            ConfigError: an option is unknown, or a word sets nothing.
-        """
+        """Return the parts of a command line."""
         parser = argparse.ArgumentParser(
             PROGRAM, add_help=False, exit_on_error=False, allow_abbrev=False
         )
@@ -200,11 +188,7 @@ class Command:
 
     @contextmanager
     def composed(self, arguments: Arguments) -> Iterator[DictConfig]:
-        """Context with the settings, in which presets can be composed.
-
-        Raises:
-            ConfigError: a name is unknown, or the grammar of a word is wrong.
-        """
+        """Context with the settings, in which presets can be composed."""
         overrides, main_folder = list(arguments.overrides), config_dir()
         name = arguments.config_name or self.config or self._store_defaults()
         known = self.config_names(arguments.config_dir)

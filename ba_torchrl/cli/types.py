@@ -17,7 +17,6 @@ from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
 MAX_NAME_BYTES = 230
 """Longest name of a file that a command writes. File systems allow 255 bytes, of which temporary
@@ -35,15 +34,7 @@ def checked(check: Callable[[Any], Any]) -> AfterValidator:
 
 
 def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
-    """Return fields of `EnvConfig`, none of which the command sets itself.
-
-    Args:
-        values: the fields.
-        reserved: by the name of each field that the command sets, what to do instead.
-
-    Raises:
-        ConfigError: one of them is given.
-    """
+    """Return fields of `EnvConfig`, none of which the command sets itself."""
     for name, instead in reserved.items():
         if name in values:
             raise ConfigError(f"{name} is set by the command; leave it out, and {instead}")
@@ -51,11 +42,7 @@ def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
 
 
 def check_new(path: str | Path) -> None:
-    """Check that nothing exists at a path.
-
-    Raises:
-        ConfigError: there is something.
-    """
+    """Check that nothing exists at a path."""
     if os.path.exists(path):
         raise ConfigError(f"{path} exists already; choose another path")
 
@@ -66,11 +53,7 @@ def _folder_exists(path: str) -> None:
 
 
 def check_writable_folder(folder: str | Path) -> None:
-    """Check that files can be written to a folder, which is created if needed.
-
-    Raises:
-        ConfigError: they cannot.
-    """
+    """Check that files can be written to a folder, which is created if needed."""
     try:
         Path(folder).mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
@@ -84,15 +67,7 @@ def check_writable_folder(folder: str | Path) -> None:
 
 
 def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written; its folder is created if needed.
-
-    Args:
-        path: of the file.
-        suffixes: allowed ends of its name; any if left out.
-
-    Raises:
-        ConfigError: it cannot, its name has another end, or it is a folder.
-    """
+    """Check that a file can be written; its folder is created if needed."""
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
         raise ConfigError(f"the name of the file ends in {' or '.join(suffixes)}, not {path.name}")
@@ -106,11 +81,7 @@ def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
 
 
 def check_untracked(paths: Iterable[str | Path]) -> None:
-    """Check that git tracks none of the files, so that a command can write over them.
-
-    Raises:
-        ConfigError: it tracks one.
-    """
+    """Check that git tracks none of the files, so that a command can write over them."""
     for path in map(Path, paths):
         command = ["git", "-C", str(path.parent), "ls-files", "--", f":(literal){path.name}"]
         try:
@@ -145,8 +116,6 @@ PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixe
 VideoFile = Annotated[
     Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
 ]
-Structures = list[Annotated[str, checked(check_has_structure)]]
-"""Ids of tasks whose structures can be deconstructed."""
 
 
 class PluginSettings(StrictModel):

@@ -46,11 +46,7 @@ class Task:
 
 
 def parse(values: dict[str, Any], _: Arguments) -> Task:
-    """Return the grid with its runs, all of them checked.
-
-    Args:
-        values: of all settings: those of `Settings`, and fields of `ExperimentConfig`.
-    """
+    """Return the grid with its runs, all of them checked."""
     settings, common = split(values, Settings)
     if not settings.dry_run:
         check_writable_folder(settings.folder)

@@ -78,13 +78,7 @@ def play(
     settings: EpisodeSettings,
     seed: int = FIRST_TEST_SEED,
 ) -> TestedPolicy:
-    """Play greedy episodes in new environments, by default those of the protocol.
-
-    Args:
-        policy: acts.
-        settings: of the episodes.
-        seed: of the first.
-    """
+    """Play greedy episodes in new environments, by default those of the protocol."""
     from ba_torchrl import make_vector_env
     from ba_torchrl.training.protocol import run_test
 

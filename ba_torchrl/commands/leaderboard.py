@@ -48,11 +48,7 @@ def main(settings: Settings) -> None:
 
 
 def read(roots: Sequence[str]) -> tuple[Leaderboard, list[Path]]:
-    """Return the table with the runs below some folders, and the folders of unfinished runs.
-
-    Raises:
-        ConfigError: there are folders and no run.
-    """
+    """Return the table with the runs below some folders, and the folders of unfinished runs."""
     from ba_torchrl.training.protocol import PROTOCOL  # imports torch, which takes seconds
 
     own, unfinished = load_runs(roots, completed)

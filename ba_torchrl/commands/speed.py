@@ -77,14 +77,7 @@ def main(settings: Settings) -> None:
 
 
 def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: bool) -> float:
-    """Return the steps of all environments together, in which the expert acts, per second.
-
-    Args:
-        task: id of the task.
-        settings: of the environments.
-        num_envs: number of environments.
-        parallel: one process per environment.
-    """
+    """Return the steps of all environments together, in which the expert acts, per second."""
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import expert_policy
 
@@ -111,12 +104,7 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
 
 
 def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
-    """Yield the configuration of each learner that is measured on a task.
-
-    Args:
-        task: id of the task.
-        settings: of the measurement.
-    """
+    """Yield the configuration of each learner that is measured on a task."""
     algorithm, usual = LEARNERS[TASKS[task].control]
     for network in (settings.networks or [usual]) if settings.updates else ():
         yield ExperimentConfig.parse(
@@ -134,12 +122,7 @@ def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
 
 
 def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
-    """Return the updates of a learner per second, with a replay of a few demonstrations.
-
-    Args:
-        config: of the learner.
-        settings: of the measurement.
-    """
+    """Return the updates of a learner per second, with a replay of a few demonstrations."""
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.training.checkpoint import build_algorithm

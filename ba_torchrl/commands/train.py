@@ -23,12 +23,7 @@ logger = logging.getLogger(__name__)
 
 
 def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
-    """Return the run; that of an existing folder if the command line only resumes it.
-
-    Args:
-        values: of all settings.
-        arguments: what of them the command line gives.
-    """
+    """Return the run; that of an existing folder if the command line only resumes it."""
     is_resumed = values["resume"] is True and (Path(values["run_dir"]) / CONFIG_FILE).exists()
     if values["resume"] is True and not is_resumed:
         logger.warning("there is no run in %s to resume: a new one starts", values["run_dir"])

@@ -71,12 +71,6 @@ def leaderboard(
     episodes than can be cited are left out. Own runs are not pooled with those of the package; a
     method of both has a second column.
 
-    Args:
-        packaged: the package's runs.
-        own: the user's runs.
-        tasks: in the order of rows.
-        protocol: the present one.
-
     Raises:
         ConfigError: runs have the same settings and seed.
     """

@@ -96,10 +96,6 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
 
     If a resumed run wrote a step twice, the later value is returned. An incomplete last row of a
     killed run is ignored.
-
-    Raises:
-        FileNotFoundError: the file does not exist.
-        ValueError: the file does not hold scalars.
     """
     path = Path(path)
     if path.is_dir():

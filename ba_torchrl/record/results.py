@@ -179,12 +179,7 @@ def write_result(folder: str | Path, result: RunResult) -> Path:
 
 
 def read_result(folder: str | Path) -> RunResult:
-    """Read the result of a run folder.
-
-    Raises:
-        FileNotFoundError: the run is not finished.
-        ValueError: the file is not the result of a run.
-    """
+    """Read the result of a run folder."""
     path = Path(folder) / RESULT_FILE
     try:
         return RunResult.model_validate_json(json_bytes(path))
