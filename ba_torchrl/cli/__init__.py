@@ -111,5 +111,5 @@ def overview() -> str:
     for name in command_names():
         # read, not imported: the import of torch takes seconds
         source = ast.parse((_FOLDER / f"{name}.py").read_text(encoding="utf-8"))
-        lines.append(f"  {name:10} {(ast.get_docstring(source) or '').splitlines()[0]}")
+        lines.append(f"  {name:11} {(ast.get_docstring(source) or '').splitlines()[0]}")
     return "\n".join(lines)

@@ -97,6 +97,7 @@ as_list = BeforeValidator(lambda value: [value] if isinstance(value, str) else v
 Count = Annotated[int, Field(ge=1)]
 NumEnvs = Annotated[int, Field(ge=1, le=MAX_ENVS)]
 Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
+Fps = Annotated[float, Field(ge=1, le=240)]
 Text = Annotated[str, Field(min_length=1)]
 Plugins = Annotated[list[str], checked(load_plugins)]
 """Modules outside the package, imported at once; the first field of a model, as others use them."""

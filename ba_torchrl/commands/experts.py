@@ -111,7 +111,7 @@ def main(settings: Settings) -> None:
 
 
 def _table_of(task: str, variants: dict[str, Any]) -> str:
-    """Return the key of a task's table: its group, the part of its id before the slash, or control."""
+    """Return the key of a task's table: its group, the start of its id, or its control."""
     group = task.split("/")[0]
     return group if group in variants else TASKS[task].control
 

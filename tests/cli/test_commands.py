@@ -45,6 +45,7 @@ COMMANDS = (
     "measure",
     "speed",
     "tasks",
+    "teleoperate",
 )
 LONG = 300 * "n"
 REFUSED = [

@@ -33,7 +33,7 @@ def test_the_overview_lists_every_command_with_its_first_line(capsys):
     out = capsys.readouterr().out
     for name in cli.command_names():
         first = load_recipe(name).__doc__.splitlines()[0]
-        assert f"{name:10} {first}" in out
+        assert f"{name:11} {first}" in out
 
 
 WITHOUT_TORCH = [

@@ -211,16 +211,15 @@ def test_failed_episodes_are_kept_by_choice(only_successful):
     ("words", "message"),
     [
         (["open_loop/block_stacking", "path=new"], "the keyboard moves the gripper of close-loop"),
-        ([TASK], "path, a folder for the demonstrations, is missing"),
+        ([TASK], "path is missing"),
         (["path=new"], "task is missing"),
-        ([TASK, "path=new", "video=film.gif"], "video: policy=keyboard writes none"),
-        ([TASK, "path=new", "policy=random"], "path: only policy=keyboard records"),
+        ([TASK, "path=new", "env.render=false"], "leave it out, and look at the window"),
     ],
 )
 def test_refusals(words, message, monkeypatch, tmp_path, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as end:
-        recipe("play", "policy=keyboard", *words)
+        recipe("teleoperate", *words)
     assert end.value.code == EXIT_CODE
     assert message in capsys.readouterr().err
 
@@ -235,9 +234,9 @@ def test_episodes_that_are_complete_are_kept(end, env, tmp_path, monkeypatch):
 
     monkeypatch.setattr("ba_torchrl.envs.factory.make", lambda *_, **__: env)
     monkeypatch.setattr("ba_torchrl.demonstrations.teleoperation.record_demonstrations", played)
-    words = (TASK, "policy=keyboard", f"path={tmp_path / 'demos'}", "env.obs_size=24")
+    words = (TASK, f"path={tmp_path / 'demos'}", "env.obs_size=24")
     with contextlib.suppress(pybullet.error):
-        recipe("play", *words)
+        recipe("teleoperate", *words)
     assert read_demonstrations(tmp_path / "demos")[1]["episodes"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["demos"]
 
@@ -269,7 +268,7 @@ def test_keys_in_the_window_record_an_episode(end, tmp_path, env):
     """The keys of an episode are sent one by one; the second episode is incomplete and not kept."""
     path = tmp_path / "demos"
     env.reset(seed=7)
-    command = [sys.executable, "-m", "ba_torchrl", "play", TASK, "policy=keyboard", "episodes=2"]
+    command = [sys.executable, "-m", "ba_torchrl", "teleoperate", TASK, "episodes=2"]
     command += [f"path={path}", "seed=7", "env.obs_size=24", "fps=3"]
     with display() as variables:
         process = subprocess.Popen(

@@ -27,6 +27,7 @@ WORK = {
     "plot": "read_config",
     "gallery": "expert_strip",
     "tasks": "page",
+    "teleoperate": "ba_torchrl.envs.factory.make",
     "export": None,  # there is no run
 }
 """The first call that works, by recipe: a name in its module, or with a module of its own."""
