@@ -2,7 +2,7 @@
 
     envs = lerobot.envs.factory.make_env("user/repository", n_envs=2, trust_remote_code=True)
 
-The entries of its observations have the names of the data sets of ``ba-torchrl export
+The entries of its observations have the names of the data sets of ``ba-torchrl convert
 format=lerobot``, so that a policy that LeRobot trains on these acts in it. The ids of the suite are
 the places of the tasks in `TASKS`. Needs `ba_torchrl` where it runs.
 """

@@ -32,6 +32,7 @@ RUN = {
 COMMANDS = (
     "benchmark",
     "collect",
+    "convert",
     "evaluate",
     "experts",
     "export",

@@ -29,6 +29,7 @@ WORK = {
     "tasks": "page",
     "teleoperate": "ba_torchrl.envs.factory.make",
     "export": None,  # there is no run
+    "convert": None,  # there are no demonstrations
 }
 """The first call that works, by recipe: a name in its module, or with a module of its own."""
 TEXTS = ("null", "true", "0", "-1", "1", "3", "1.5", ".nan", "1e30", "text", "''", "[]", "[a]")
