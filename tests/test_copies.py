@@ -73,7 +73,7 @@ def sample(replay):
 
 def learner(algorithm, network, **settings):
     """Return a learner after an update."""
-    learner = build(algorithm, network, buffer_size=64, batch_size=4, **settings)
+    learner = build(algorithm, network, batch_size=4, **settings)
     learner.extend(transitions(learner))
     learner.update()
     return learner
@@ -124,14 +124,14 @@ POLICIES = {
     "Equi ASR": STACKING,
 }
 LEARNERS = {
-    "sac cnn": {"augmentation": "so2"},
-    "sac equi": {"policy_average": 0.9},
-    "sac ferm": {"view_transform": "shift", "contrastive_weight": 1.0},
+    "sac cnn": {"rotation": {"name": "sampled"}},
+    "sac equi": {"optimizer": {"policy_average": 0.9}},
+    "sac ferm": {"views": {"name": "shift"}, "contrastive": {"name": "info_nce"}},
     "rlpd cnn": {},
     "rlpd equi": {},
     "bc equi": {},
-    "dagger equi_asr": {"augmentation": "se2", "beta_init": 0.0},
-    "spatial_q asr": {"augmentation": "d4", "epsilon_init": 0.5},
+    "dagger equi_asr": {"rotation": {"name": "se2"}, "beta_init": 0.0},
+    "spatial_q asr": {"rotation": {"name": "d4"}, "epsilon_init": 0.5},
     "spatial_q fcn": {},
     "spatial_q rot_fcn": {},
     "spatial_q equi_fcn": {},
@@ -147,7 +147,10 @@ RETURNED = {
         for name, settings in LEARNERS.items()
     },
     **{
-        f"replay, {kind}": (lambda kind=kind: learner("sac", "cnn", replay=kind).replay, sample)
+        f"replay, {kind}": (
+            lambda kind=kind: learner("sac", "cnn", replay={"name": kind}).replay,
+            sample,
+        )
         for kind in get_args(ReplayKind)
     },
     "sampler": (partial(SymmetricSampler, seed=3), SymmetricSampler.state_dict),

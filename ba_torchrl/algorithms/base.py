@@ -6,46 +6,37 @@ An algorithm is a `LearnerConfig`, registered under its name, and a `Learner` th
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from enum import IntEnum
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
-from typing import Any, ClassVar, Literal
+from typing import Any
 
-import numpy as np
 import torch
-from pydantic import Field, model_validator
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
 from torch import Tensor, nn
-from torch.optim import Adam, Optimizer
-from torch.optim.lr_scheduler import LinearLR, LRScheduler
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
+from torch.optim import Optimizer
+from torch.optim.lr_scheduler import LRScheduler
 from torchrl.data import ReplayBuffer
 from torchrl.envs import Transform
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 from torchrl.trainers import OptimizationStepper
-from typing_extensions import Self
 
 from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
+from ba_torchrl.algorithms.config import ALGORITHMS, LearnerConfig
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.optimizers import LossFunction, Optimizers, Update
+from ba_torchrl.algorithms.problem import Problem, SeedUse, derive_seed
 from ba_torchrl.core import keys
-from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.core.config import StrictModel, changed
 from ba_torchrl.core.errors import ConfigError, PartError
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.core.registry import Registry
 from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
-from ba_torchrl.data.replay.make import ReplayKind, make_replay
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device, to_device
-from ba_torchrl.data.transitions import WITH_TARGET, Imitation, as_transitions
+from ba_torchrl.data.transitions import WITH_TARGET, as_transitions
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
 from ba_torchrl.modules.layers import compute_dtype
-from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss
 
 __all__ = [
@@ -62,183 +53,11 @@ __all__ = [
     "network_dtype",
 ]
 
-ALGORITHMS: Registry[type[LearnerConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
-
-
-class SeedUse(IntEnum):
-    """Uses of randomness in a run.
-
-    Initial weights and the actions that SAC samples are drawn from torch's global generator, which
-    is seeded with the seed of the run. Tests have seeds of their own; see
-    `ba_torchrl.training.protocol`.
-    """
-
-    DEMONSTRATIONS = 0
-    COLLECTION = 1
-    EVALUATION = 2
-    REPLAY = 5
-    AUGMENTATION = 6
-    EXPLORATION = 7
-    VIEWS = 8
-    """Random views of sampled images."""
-    STORED_AUGMENTATION = 9
-    """Augmented copies that are stored with each transition."""
-    ENSEMBLE = 10
-    """Subsets of an ensemble of critics."""
-    MIXTURE = 11
-    """Choice between the actions of policy and expert."""
-
-
-def derive_seed(seed: int, use: SeedUse, part: int = 0) -> int:
-    """Return the seed of one use of randomness in the run with a seed, or of one of its parts."""
-    return int(np.random.SeedSequence([seed, use, part]).generate_state(1)[0])
-
-
-@dataclass(frozen=True)
-class Problem:
-    """Description of the environments and the run for which an algorithm is built."""
-
-    control: Control
-    """Control of the task."""
-    images: Mapping[str, ImageSpec]
-    """Declarations of the images that the environment observes, by key."""
-    actions: CloseLoopActions | OpenLoopActions
-    """The action vector."""
-    total_updates: int
-    """Gradient updates of the run, the length of schedules."""
-    seed: int
-    device: torch.device
-    vectors: Mapping[str, int] = field(default_factory=dict)
-    """Length of each vector that the environment observes, by key."""
-    center_m: tuple[float, float] = (0.0, 0.0)
-    """x and y of the workspace's centre."""
-    pretrain_updates: int = 0
-    """The first of `total_updates`, before the first collection."""
-
-    def derived_seed(self, use: SeedUse) -> int:
-        """Return the run's seed for one use of randomness."""
-        return derive_seed(self.seed, use)
-
 
 def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
     """Return the number format of a network's convolutions on a device; float32 for a network
     without the field ``precision``."""
     return compute_dtype(getattr(network, "precision", "float32"), device)
-
-
-_OF_PRIORITIES = (
-    "priority_exponent",
-    "importance_exponent",
-    "importance_weighted",
-    "importance_norm",
-    "expert_bonus",
-)
-"""Fields of a prioritised replay."""
-
-
-class LearnerConfig(StrictModel, ABC):
-    """Hyper-parameters of an algorithm, from which it is built for a network and a problem.
-
-    Learning rate, batch, capacity, exponents and bonus are those of appendix G.2. Each other field
-    says where its default is from.
-    """
-
-    controls: ClassVar[frozenset[Control]]
-    """Controls of the tasks that the algorithm supports."""
-    collects: ClassVar[bool] = True
-    """Whether the policy collects transitions; if not, all updates are on the demonstrations."""
-    is_compilable: ClassVar[bool] = True
-    """Whether `Learner.compile` is possible."""
-
-    learning_rate: float = Field(default=1e-3, gt=0, le=1e3)
-    """Learning rate of Adam."""
-    learning_rate_end_factor: float = Field(default=1.0, gt=0, le=1)
-    """Final fraction of the learning rate, which decreases linearly over the run; constant in the
-    reference implementation."""
-    weight_decay: float = Field(default=0.0, ge=0)
-    """Adam's L2 term on the networks' parameters; none in the reference implementation's SAC."""
-    gradient_clamp: float | None = Field(default=None, gt=0)
-    """Bound of each element of the networks' gradient; None for no bound, as in the reference
-    implementation's SAC."""
-    policy_average: float = Field(default=0.0, ge=0, lt=1)
-    """Decay of the exponential moving average of the policy's parameters with which the policy
-    acts; 0 for acting with the last parameters. None in the appendix."""
-    batch_size: int = Field(default=64, ge=1)
-    """Transitions per update."""
-    replay: ReplayKind = "uniform"
-    """Sampling of transitions: "uniform", "prioritized" or "symmetric"."""
-    buffer_size: int = Field(default=100_000, ge=1)
-    """Transitions in the replay, demonstrations and others together."""
-    priority_exponent: float = Field(default=0.6, ge=0)
-    """Exponent alpha of the priorities of a prioritised replay."""
-    importance_exponent: float = Field(default=0.4, ge=0, le=1)
-    """Initial exponent beta of the importance weights, which increases to 1 over the run; with 0,
-    the weights are 1 throughout."""
-    importance_weighted: WeightedTerms = "critic_and_policy"
-    """Terms of the loss that the importance weights multiply: "none", "critic",
-    "critic_and_policy", or "all", which adds those on demonstrations and the temperature. The
-    appendix does not say; the reference implementation computes weights and does not use them."""
-    importance_norm: WeightNorm = "max"
-    """Statistic of a batch by which its importance weights are divided: "max", as in Schaul et al.
-    (2016), or "mean", for the weighted mean of TorchRL's losses."""
-    expert_bonus: float = Field(default=1.0, ge=0)
-    """Added to the priority of demonstrations."""
-    init: Literal["random", "bc"] = "random"
-    """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
-    updates are behaviour cloning of the demonstrations instead of updates of the algorithm. Critics
-    are not trained meanwhile: without a behaviour term, SAC then unlearns the policy."""
-
-    @model_validator(mode="after")
-    def _check_halves(self) -> Self:
-        if self.replay == "symmetric" and self.batch_size < 2:
-            raise ValueError("batch_size must be at least 2 with a symmetric replay, half of each")
-        return self
-
-    @property
-    def imitates(self) -> Imitation:
-        """Which action the loss imitates, and on which transitions; by default the executed action
-        of demonstrations, and with ``init="bc"`` the expert's."""
-        return "expert" if self.init == "bc" else "executed"
-
-    @property
-    def init_entropy_weight(self) -> float:
-        """Weight of the policy's negative entropy in the updates of behaviour cloning of
-        ``init="bc"``."""
-        return 0.0
-
-    @property
-    def pretraining_option(self) -> str | None:
-        """The option and its value that only affect updates before the first collection, which
-        the run must then have; None if there is none."""
-        return "init: 'bc'" if self.init == "bc" else None
-
-    def check(self, network: NetworkConfig, control: Control) -> None:
-        """Check that the algorithm supports the task's control, and that the network does.
-
-        Raises:
-            ConfigError: the algorithm or the network does not support this control.
-        """
-        if control not in self.controls:
-            known = [name for name in ALGORITHMS if control in ALGORITHMS[name].controls]
-            why = f"learns {' and '.join(sorted(self.controls))} tasks, not {control} ones"
-            name = ALGORITHMS.name_of(type(self))
-            raise PartError("algorithm", name, why, known, f"{control} tasks")
-        if network.control != control:
-            known = [name for name in NETWORKS if NETWORKS[name].control == control]
-            why, name = f"is for {network.control} tasks", NETWORKS.name_of(type(network))
-            raise PartError("network", name, why, known, f"{control} tasks")
-
-    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """Yield a message for each value that has no effect together with the others and the
-        network; by default, for fields of another replay."""
-        if self.replay != "prioritized":
-            yield from changed(self, _OF_PRIORITIES, "without replay='prioritized'")
-        elif self.importance_weighted == "none":
-            yield from changed(self, ["importance_norm"], "with importance_weighted='none'")
-
-    @abstractmethod
-    def build(self, network: NetworkConfig, problem: Problem) -> Learner:
-        """Return a freshly initialised algorithm."""
 
 
 class Learner(ABC):
@@ -295,10 +114,7 @@ class Learner(ABC):
         policy = self.make_policy(networks)
         self.loss = self.make_loss(networks).to(problem.device)
         self.trained_policy = policy.to(problem.device)
-        self.averaged_policy = None
-        if config.policy_average:
-            average = get_ema_multi_avg_fn(config.policy_average)
-            self.averaged_policy = AveragedModel(self.trained_policy, multi_avg_fn=average)
+        self.averaged_policy = config.optimizer.average(self.trained_policy)
         acting = self.averaged_policy.module if self.averaged_policy else self.trained_policy
         self.policy = ActingPolicy(
             acting, self.make_acting_transforms(), self.make_exploration()
@@ -384,16 +200,10 @@ class Learner(ABC):
 
     def make_replay(self) -> ReplayBuffer:
         """Return the replay that the configuration names."""
-        config = self.config
-        return make_replay(
-            config.replay,
-            config.buffer_size,
-            config.batch_size,
-            codecs=self.codecs,
+        return self.config.replay.build(
+            self.config.batch_size,
+            self.codecs,
             seed=self.problem.derived_seed(SeedUse.REPLAY),
-            priority_exponent=config.priority_exponent,
-            weight_exponent=config.importance_exponent,
-            expert_bonus=config.expert_bonus,
             returns_codes=self.problem.device.type != "cpu",
         )
 
@@ -419,26 +229,18 @@ class Learner(ABC):
             self.optimizer,
             self.make_term_optimizers(),
             self.make_scheduler,
-            clamp=self.config.gradient_clamp,
+            clamp=self.config.optimizer.gradient_clamp,
             clamped=self.network_parameters(),
         )
 
     def make_scheduler(self, optimizer: Optimizer) -> LRScheduler:
         """Return the schedule of an optimiser's learning rate, which steps once per update."""
-        end, updates = self.config.learning_rate_end_factor, self.problem.total_updates
-        return LinearLR(optimizer, start_factor=1.0, end_factor=end, total_iters=updates)
+        return self.config.optimizer.schedule(optimizer, self.problem.total_updates)
 
     def adam(self, parameters: Iterable[nn.Parameter], factor: float = 1.0) -> Optimizer:
         """Return Adam for some parameters with a factor on the learning rate, and with weight decay
         on those of the networks only."""
-        others = {id(parameter): parameter for parameter in parameters}
-        decayed = [p for p in self.network_parameters() if others.pop(id(p), None) is not None]
-        groups = [
-            {"params": decayed, "weight_decay": self.config.weight_decay},
-            {"params": list(others.values()), "weight_decay": 0.0},
-        ]
-        groups = [group for group in groups if group["params"]]
-        return Adam(groups, lr=factor * self.config.learning_rate, fused=True)
+        return self.config.optimizer.adam(parameters, self.network_parameters(), factor)
 
     def network_parameters(self) -> list[nn.Parameter]:
         """Return the parameters to which weight decay and the gradient's bound apply."""
@@ -479,7 +281,7 @@ class Learner(ABC):
         """Add transitions [N], and augmented copies if configured, to the replay, except those with
         a fault."""
         new = self.entries_per_transition * len(transitions)
-        if len(self.replay) + new > self.config.buffer_size:
+        if len(self.replay) + new > self.config.replay.capacity:
             self.host_tasks.run()  # before its transitions are overwritten: deferred priorities
         self.replay.extend(transitions)
 
@@ -573,7 +375,8 @@ class Learner(ABC):
             FloatingPointError: a loss is not finite.
             ValueError: the losses of a stage have different optimisers.
         """
-        update = Update(stages, self._check_finite, self.optimizer, self.config.gradient_clamp)
+        clamp = self.config.optimizer.gradient_clamp
+        update = Update(stages, self._check_finite, self.optimizer, clamp)
         scalars = self.stepper.step(update, batch)
         self.update_target()
         return scalars

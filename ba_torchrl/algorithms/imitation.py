@@ -19,9 +19,10 @@ from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
+from ba_torchrl.algorithms.parts.replay import Uniform
+from ba_torchrl.algorithms.parts.rotation import NoRotation, RigidRotation
 from ba_torchrl.algorithms.spatial_actions import (
-    RigidAugmentationConfig,
     demonstration_on_grid,
     make_spatial_values,
 )
@@ -35,7 +36,7 @@ from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialPolicy, spa
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
 
 
-class ImitationConfig(RigidAugmentationConfig):
+class ImitationConfig(LearnerConfig):
     """Hyper-parameters of a policy that is trained on the expert's actions alone.
 
     The loss is the divergence of sampled actions from the expert's in close-loop tasks, and the
@@ -45,16 +46,18 @@ class ImitationConfig(RigidAugmentationConfig):
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop", "open_loop"})
 
-    replay: Literal["uniform"] = "uniform"
+    rotation: RigidRotation = NoRotation()
+    """Rigid transforms of sampled open-loop transitions."""
+    replay: Uniform = Uniform()
     init: Literal["random"] = "random"
 
     def check(self, network: NetworkConfig, control: Control) -> None:
         """As for `LearnerConfig`; rigid transforms in close loop are refused too."""
         super().check(network, control)
-        if control == "close_loop" and self.augmentation != "none":
+        if control == "close_loop" and self.rotation.name != "none":
             raise ConfigError(
-                f"algorithm.augmentation: {self.augmentation!r} transforms open_loop transitions; "
-                "leave it at 'none' for close_loop tasks"
+                f"algorithm.rotation.name: {self.rotation.name!r} transforms open_loop "
+                "transitions; leave it at 'none' for close_loop tasks"
             )
 
 
@@ -131,7 +134,7 @@ class BC(Learner):
         """Return the rigid transforms of sampled open-loop transitions."""
         if self.actions is None:
             return []
-        return self.config.make_transforms(
+        return self.config.rotation.build(
             self.problem, self.images, self.actions, keys.TARGET_ACTION
         )
 

@@ -9,7 +9,7 @@ the demonstrations alone; with fewer, the remaining updates are online.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar, Literal, NamedTuple
+from typing import Annotated, ClassVar, NamedTuple
 
 from pydantic import Field
 from tensordict.nn import TensorDictModule
@@ -18,6 +18,7 @@ from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import IQLLoss, SoftUpdate
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem
+from ba_torchrl.algorithms.parts.replay import Symmetric, Uniform
 from ba_torchrl.core import keys
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
@@ -37,7 +38,7 @@ class IQLConfig(LearnerConfig):
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
 
-    replay: Literal["uniform", "symmetric"] = "uniform"
+    replay: Annotated[Uniform | Symmetric, Field(discriminator="name")] = Uniform()
     expectile: float = Field(default=0.9, gt=0, lt=1)
     """Expectile of the actions' values that is the value of a state."""
     temperature: float = Field(default=10.0, ge=0)

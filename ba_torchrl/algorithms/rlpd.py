@@ -8,7 +8,7 @@ update of the policy. There is no term that imitates the demonstrations.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import ClassVar, Literal
+from typing import ClassVar
 
 import torch
 from pydantic import Field
@@ -17,6 +17,8 @@ from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LinearLR
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Problem, SeedUse
+from ba_torchrl.algorithms.parts.imitation import Behaviour, NoImitation
+from ba_torchrl.algorithms.parts.replay import Symmetric
 from ba_torchrl.algorithms.sac import SAC, SACConfig
 from ba_torchrl.core.errors import ConfigError, PartError
 from ba_torchrl.data.transitions import Imitation
@@ -37,7 +39,7 @@ class RLPDConfig(SACConfig):
     is_compilable: ClassVar[bool] = False
     """False: the host draws members of the ensemble in each update."""
 
-    replay: Literal["symmetric"] = "symmetric"
+    replay: Symmetric = Symmetric()
     critics: int = Field(default=10, ge=2)
     """Number of critics in the ensemble."""
     subset: int = Field(default=2, ge=1)
@@ -46,14 +48,13 @@ class RLPDConfig(SACConfig):
     """Critic updates per update of the policy, each on another batch."""
     entropy_backup: bool = False
     """Whether targets have the entropy term."""
-    demonstration_weight: float = Field(default=0.0, ge=0)
-    """Weight of SACfD's behaviour term, which Ball et al. (2023) do not have."""
+    imitation: Behaviour = NoImitation()
+    """SACfD's behaviour term, which Ball et al. (2023) do not have."""
 
     @property
     def imitates(self) -> Imitation:
         """No action without such a term: all transitions have the same loss."""
-        is_imitating = self.init == "bc" or self.demonstration_weight or self.imitate_successes
-        return "expert" if is_imitating else "none"
+        return "none" if self.init == "random" and self.imitation.name == "none" else "expert"
 
     def build(self, network: NetworkConfig, problem: Problem) -> RLPD:
         """Return a freshly initialised learner.
@@ -96,14 +97,9 @@ class RLPD(SAC):
 
     def make_scheduler(self, optimizer: Optimizer) -> LinearLR:
         """Return the schedule of the learning rate, which steps once per critic update."""
-        problem = self.problem
-        own = self.own_updates(problem.total_updates)
-        return LinearLR(
-            optimizer,
-            start_factor=1.0,
-            end_factor=self.config.learning_rate_end_factor,
-            total_iters=problem.total_updates + own * (self.config.critic_updates - 1),
-        )
+        updates = self.problem.total_updates
+        further = self.own_updates(updates) * (self.config.critic_updates - 1)
+        return self.config.optimizer.schedule(optimizer, updates + further)
 
     def update(self) -> TensorDict:
         """Take the critic updates, the last one together with that of policy and temperature."""

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
-from typing import Any, ClassVar, Literal
+import logging
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field, model_validator
@@ -26,23 +27,18 @@ from ba_torchrl.algorithms.base import (
     Problem,
     SeedUse,
 )
+from ba_torchrl.algorithms.parts.contrastive import Contrastive, NoContrastive
+from ba_torchrl.algorithms.parts.imitation import Behaviour, Demonstrations
+from ba_torchrl.algorithms.parts.rotation import NoRotation, Rotation
+from ba_torchrl.algorithms.parts.views import NoViews, Views
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import changed
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
-from ba_torchrl.data.augmentation.views import (
-    CenterCrop,
-    RandomViews,
-    ViewTransform,
-    cropped_images,
-)
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation
-from ba_torchrl.demonstrations.episodes import EpisodeAssembler
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
-from ba_torchrl.objectives.imitation import ActionDistance
-from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SACfDLoss, SoftUpdateByNetwork
+from ba_torchrl.objectives.sacfd import SACfDLoss, SoftUpdateByNetwork
+
+logger = logging.getLogger(__name__)
 
 
 @ALGORITHMS.register("sac")
@@ -70,75 +66,23 @@ class SACConfig(LearnerConfig):
     bootstrap_truncated: bool = True
     """Whether targets bootstrap on steps that the time limit truncates; the reference
     implementation does not."""
-    demonstration_weight: float = Field(default=1.0, ge=0)
-    """Weight of the behaviour term; 0 for plain SAC; reference implementation."""
-    demonstration_distance: ActionDistance = "mse"
-    """Distance of the policy's action from the demonstrated one in the behaviour term: the squared
-    error of the reference implementation, or "kl", whose gradient does not vanish at the ends of
-    the range."""
-    imitate_successes: bool = False
-    """Whether collected episodes that succeed count as demonstrations (self-imitation; Oh et al.,
-    2018): the behaviour term and the expert bonus apply to them, until demonstrations fill half of
-    the replay. Transitions then enter the replay when their episode ends. Not in the appendix."""
+    imitation: Behaviour = Demonstrations()
+    """The behaviour term, which pulls the policy to demonstrated actions."""
     exploration_noise: float = Field(default=0.0, ge=0)
     """Standard deviation of Gaussian noise that is added to collected actions, which are then
     clipped to [-1, 1]. None in the appendix."""
-    augmentation: Literal["none", "so2"] = "none"
+    rotation: Rotation = NoRotation()
     """Rotation of transitions about the z axis; none in the appendix."""
-    augmentation_probability: float = Field(default=0.8, ge=0, le=1)
-    """Probability of rotating a sampled transition; not in the appendix."""
-    stored_copies: int = Field(default=0, ge=0)
-    """Number of rotated copies that are stored with each transition, which is then not rotated when
-    it is sampled; 0 to rotate sampled transitions."""
-    view_transform: ViewTransform = "none"
-    """Random views of sampled images: a "crop", or a "shift" by some pixels. Acting takes the
-    centre of the image."""
-    crop_size: int = Field(default=128, ge=1)
-    """Rows and columns of a crop, pixels."""
-    shift_pixels: int = Field(default=4, ge=1)
-    """Largest shift, pixels; that of Kostrikov et al. (2021)."""
-    views: int = Field(default=1, ge=1)
-    """Views of each observation, over which the losses are averaged."""
-    target_views: int = Field(default=1, ge=1)
-    """Views of each next observation, over which the target is averaged."""
-    contrastive_weight: float = Field(default=0.0, ge=0)
-    """Factor on the learning rate of the two optimisers of the encoder's contrastive loss on pairs
-    of views; 0 for no such loss. Adam's steps do not depend on a factor on the loss. The FERM
-    presets have 1, as the reference implementation; the appendix gives no weight."""
-    pretraining: Literal["all", "contrastive"] = "all"
-    """Losses that updates before the first collection minimise: all, or the contrastive one alone,
-    with ``init="bc"`` together with that of behaviour cloning."""
+    views: Views = NoViews()
+    """Random views of sampled images."""
+    contrastive: Contrastive = NoContrastive()
+    """A loss of the encoder on pairs of views."""
 
     @model_validator(mode="after")
     def _check_options(self) -> Self:
-        needs_views = self.views > 1 or self.target_views > 1 or self.contrastive_weight > 0
-        if needs_views and self.view_transform == "none":
-            raise ValueError("several views or a contrastive loss need view_transform")
-        if self.pretraining == "contrastive" and not self.contrastive_weight:
-            raise ValueError("pretraining 'contrastive' needs contrastive_weight")
-        if self.stored_copies and self.augmentation == "none":
-            raise ValueError("stored_copies needs augmentation")
+        if self.contrastive.name != "none" and self.views.name == "none":
+            raise ValueError("contrastive compares views: set views.name")
         return self
-
-    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `LearnerConfig`: fields of other augmentations, of a term without weight, and a
-        contrastive loss that does not reach the policy."""
-        yield from super().without_effect(network)
-        if self.augmentation == "none" or self.stored_copies:
-            why = "without augmentation='so2' of sampled transitions"
-            yield from changed(self, ["augmentation_probability"], why)
-        if self.view_transform != "crop":
-            yield from changed(self, ["crop_size"], "without view_transform='crop'")
-        if self.view_transform != "shift":
-            yield from changed(self, ["shift_pixels"], "without view_transform='shift'")
-        if not self.demonstration_weight:
-            why = "with demonstration_weight=0"
-            yield from changed(self, ["demonstration_distance"], why)
-            if self.replay == "uniform":
-                yield from changed(self, ["imitate_successes"], f"{why} and uniform replay")
-        if self.contrastive_weight and getattr(network, "shares_encoder", None) is False:
-            name = NETWORKS.name_of(type(network))
-            yield f"contrastive_weight has no effect on the encoder of the policy of {name!r}"
 
     @property
     def imitates(self) -> Imitation:
@@ -153,8 +97,8 @@ class SACConfig(LearnerConfig):
     @property
     def pretraining_option(self) -> str | None:
         """As for `LearnerConfig`."""
-        if self.pretraining == "contrastive":
-            return "pretraining: 'contrastive'"
+        if self.contrastive.pretraining == "contrastive":
+            return "contrastive.pretraining: 'contrastive'"
         return super().pretraining_option
 
     def build(self, network: NetworkConfig, problem: Problem) -> SAC:
@@ -173,18 +117,19 @@ class SAC(Learner):
     loss: SACfDLoss
 
     def __init__(self, config: SACConfig, network: NetworkConfig, problem: Problem) -> None:
-        self.episodes = EpisodeAssembler() if config.imitate_successes else None
+        self.episodes = config.imitation.build()
         super().__init__(config, network, problem)
 
     @property
     def seen_images(self) -> Mapping[str, ImageSpec]:
         """Declarations of the images that the networks see, which are crops if configured."""
-        if self.config.view_transform != "crop":
-            return self.images
-        return cropped_images(self.images, self.config.crop_size)
+        return self.config.views.seen(self.images)
 
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and critic."""
+        if self.config.contrastive.name != "none" and not getattr(network, "shares_encoder", True):
+            name = NETWORKS.name_of(type(network))
+            logger.warning("contrastive has no effect on the encoder of the policy of %r", name)
         networks = network.build(self.network_spec)
         for module in networks:  # before the loss, since networks may share parameters
             module.to(self.problem.device)
@@ -196,10 +141,7 @@ class SAC(Learner):
 
     def make_acting_transforms(self) -> list[Transform]:
         """Return the images' codecs, and their central part where the networks see crops."""
-        transforms = super().make_acting_transforms()
-        if self.config.view_transform == "crop":
-            transforms.append(CenterCrop(self.config.crop_size, list(self.images)))
-        return transforms
+        return [*super().make_acting_transforms(), *self.config.views.acting(self.images)]
 
     def make_exploration(self) -> AdditiveGaussianModule | None:
         """Return the noise of collected actions, if configured."""
@@ -233,13 +175,11 @@ class SAC(Learner):
             alpha_init=config.alpha_init,
             target_entropy=config.target_entropy,
             entropy_backup=config.entropy_backup,
-            demonstration_weight=config.demonstration_weight,
-            demonstration_distance=config.demonstration_distance,
-            weighted_terms=config.importance_weighted,
-            weight_norm=config.importance_norm,
-            views=config.views,
-            target_views=config.target_views,
-            contrastive=self._make_contrastive(networks.encoder),
+            **config.imitation.loss_options,
+            **config.replay.loss_options,
+            views=config.views.views,
+            target_views=config.views.target_views,
+            contrastive=config.contrastive.build(networks.encoder, self.seen_images),
             **options,
         )
         if config.imitates in WITH_TARGET:
@@ -247,16 +187,6 @@ class SAC(Learner):
         if not config.bootstrap_truncated:
             loss.set_keys(terminated=loss.tensor_keys.done)
         return loss.make_value_estimator(gamma=config.gamma)
-
-    def _make_contrastive(self, encoder: nn.Module) -> BilinearInfoNCE | None:
-        if not self.config.contrastive_weight:
-            return None
-        device = self.problem.device
-        shapes = (image.shape for image in self.seen_images.values())
-        images = [torch.zeros(shape, device=device) for shape in shapes]
-        with torch.no_grad():  # without vectors, which are not compared
-            features = encoder(*images, torch.zeros(1, device=device))
-        return BilinearInfoNCE(features.shape[-1])
 
     def make_stages(self) -> list[LossFunction]:
         """Return the loss of actor, critics and temperature and, if configured, then the
@@ -275,33 +205,20 @@ class SAC(Learner):
     @property
     def entries_per_transition(self) -> int:
         """A transition and its rotated copies."""
-        return 1 + self.config.stored_copies
+        return 1 + self.config.rotation.copies
 
     def make_transforms(self) -> list[Transform]:
         """Return the rotation, of stored copies or of sampled transitions, and the views of images,
         if configured."""
-        config, parts = self.config, []
-        if config.stored_copies:
-            rotation = self._make_rotation(1.0, SeedUse.STORED_AUGMENTATION)
-            parts.append(StoredCopies(rotation, config.stored_copies))
-        elif config.augmentation == "so2":
-            probability = config.augmentation_probability
-            parts.append(self._make_rotation(probability, SeedUse.AUGMENTATION))
-        if config.view_transform != "none":
-            is_crop = config.view_transform == "crop"
-            parts.append(
-                RandomViews(
-                    self.images,
-                    self.vectors,
-                    size=config.crop_size if is_crop else None,
-                    padding=0 if is_crop else config.shift_pixels,
-                    views=config.views,
-                    target_views=config.target_views,
-                    has_positive=config.contrastive_weight > 0,
-                    seed=self.problem.derived_seed(SeedUse.VIEWS),
-                )
-            )
-        return parts
+        config = self.config
+        rotation = config.rotation.build(self.problem, self.images, self.vectors)
+        views = config.views.build(
+            self.images,
+            self.vectors,
+            seed=self.problem.derived_seed(SeedUse.VIEWS),
+            has_positive=config.contrastive.name != "none",
+        )
+        return rotation + views
 
     def make_optimizer(self) -> Optimizer:
         """Return Adam for all parameters but the contrastive loss's similarity."""
@@ -319,24 +236,10 @@ class SAC(Learner):
             return {}
         encoder = list(self.loss.encoder_network_params.parameters())
         chosen = {"encoder": encoder, "contrastive": [*encoder, *contrastive.parameters()]}
-        weight = self.config.contrastive_weight
+        weight = self.config.contrastive.weight
         return {
             "loss_contrastive": {name: self.adam(each, weight) for name, each in chosen.items()}
         }
-
-    def _make_rotation(self, probability: float, use: SeedUse) -> SO2Augmentation:
-        if self.vectors:
-            raise ConfigError(
-                f"augmentation 'so2' rotates images and actions, but not the network's vectors "
-                f"({', '.join(self.vectors)}): use augmentation 'none', or leave out "
-                "network.vector_keys"
-            )
-        return SO2Augmentation(
-            self.images,
-            self.problem.actions.sequence,
-            probability=probability,
-            seed=self.problem.derived_seed(use),
-        )
 
     def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
         """Return collected data as the transitions [N] that the replay stores; if successes are
@@ -346,7 +249,7 @@ class SAC(Learner):
         data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
         new = self.entries_per_transition * int(data[keys.IS_EXPERT].sum())
         stored = self.replay.num_demonstrations + new
-        if stored > self.config.buffer_size // 2:  # demonstrations are never overwritten
+        if stored > self.config.replay.capacity // 2:  # demonstrations are never overwritten
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
         return super().to_transitions(data, is_demonstration=True)
 
@@ -368,8 +271,8 @@ class SAC(Learner):
         return [p for p in self.loss.parameters() if p is not self.loss.log_alpha]
 
     def pretrain_update(self) -> TensorDict:
-        """Take one update on the demonstrations, as `SACConfig.pretraining` says."""
-        if self.config.pretraining == "all":
+        """Take one update on the demonstrations, as `InfoNCE.pretraining` says."""
+        if self.config.contrastive.pretraining == "all":
             return super().pretrain_update()
         batch = self.sample(demonstrations_only=self.init_loss is not None)
         stages = [self.loss.contrastive_loss]

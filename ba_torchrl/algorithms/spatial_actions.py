@@ -1,69 +1,19 @@
-"""Spatial Q networks, demonstrations on their grid of actions and rigid augmentation."""
+"""Spatial Q networks, and demonstrations on their grid of actions."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 
 import torch
-from pydantic import Field
 from tensordict import TensorDictBase
-from torchrl.envs import Transform
 
-from ba_torchrl.algorithms.base import LearnerConfig, Problem, SeedUse
+from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import OpenLoopActions
-from ba_torchrl.core.config import changed
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation, RigidTransforms
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.base import SpatialSpec
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
-
-
-class RigidAugmentationConfig(LearnerConfig):
-    """Hyper-parameters of algorithms that transform sampled open-loop transitions."""
-
-    augmentation: RigidTransforms = "none"
-    """Rigid transforms of sampled open-loop transitions: "translation", "cn", "d4" or "se2"."""
-    augmentation_probability: float = Field(default=1.0, ge=0, le=1)
-    """Probability of transforming a sampled transition."""
-    augmentation_order: int = Field(default=16, ge=1)
-    """Number of rotations n of "cn"."""
-
-    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `LearnerConfig`: also fields of other augmentations."""
-        yield from super().without_effect(network)
-        if self.augmentation == "none":
-            yield from changed(self, ["augmentation_probability"], "without augmentation")
-        if self.augmentation != "cn":
-            yield from changed(self, ["augmentation_order"], "without augmentation='cn'")
-
-    def make_transforms(
-        self,
-        problem: Problem,
-        images: Mapping[str, ImageSpec],
-        grid: SpatialActions,
-        action_key: str = keys.ACTION,
-    ) -> list[Transform]:
-        """Return the rigid transforms of sampled transitions, if configured; arguments as for
-        `RigidAugmentation`.
-
-        Raises:
-            ValueError: images or actions of the task cannot be transformed.
-        """
-        if self.augmentation == "none":
-            return []
-        augmentation = RigidAugmentation(
-            self.augmentation,
-            problem.actions,
-            images,
-            seed=problem.derived_seed(SeedUse.AUGMENTATION),
-            probability=self.augmentation_probability,
-            order=self.augmentation_order,
-            grid=grid,
-            action_key=action_key,
-        )
-        return [augmentation]
 
 
 def make_spatial_values(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import Any, ClassVar
 
 import torch
@@ -13,22 +13,32 @@ from torch import Tensor
 from torchrl.envs import Transform
 from torchrl.objectives import HardUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, Problem, SeedUse
+from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
+from ba_torchrl.algorithms.parts.imitation import Margin, SpatialImitation
+from ba_torchrl.algorithms.parts.optimizer import OptimizerConfig
+from ba_torchrl.algorithms.parts.replay import Replay, Symmetric
+from ba_torchrl.algorithms.parts.rotation import NoRotation, RigidRotation
 from ba_torchrl.algorithms.spatial_actions import (
-    RigidAugmentationConfig,
     demonstration_on_grid,
     make_spatial_values,
 )
-from ba_torchrl.core.config import changed
-from ba_torchrl.data.replay.make import ReplayKind
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.base import NetworkConfig
 from ba_torchrl.modules.spatial.policy import SpatialPolicy, SpatialValues, spatial_policy
-from ba_torchrl.objectives.dqn import Demonstrations, LevelDQNLoss
+from ba_torchrl.objectives.dqn import LevelDQNLoss
+
+
+class SpatialOptimizerConfig(OptimizerConfig):
+    """Hyper-parameters of the steps along the gradient."""
+
+    learning_rate: float = Field(default=1e-4, gt=0, le=1e3)
+    weight_decay: float = Field(default=1e-5, ge=0)
+    gradient_clamp: float | None = Field(default=1.0, gt=0)
+    """Bound of each element of the gradient; reference implementation."""
 
 
 @ALGORITHMS.register("spatial_q")
-class SpatialQConfig(RigidAugmentationConfig):
+class SpatialQConfig(LearnerConfig):
     """Hyper-parameters of spatial Q-learning; its variants are presets in ``configs/algorithm``.
 
     The defaults are those of SDQfD in appendix G.1. Where the appendix gives no value, the default
@@ -37,26 +47,17 @@ class SpatialQConfig(RigidAugmentationConfig):
 
     controls: ClassVar[frozenset[Control]] = frozenset({"open_loop"})
 
-    demonstrations: Demonstrations = "sdqfd"
-    """The term on demonstrated actions: "none", "dqfd", "sdqfd" or "adet"."""
-    demonstration_weight: float = Field(default=0.1, ge=0)
-    """Weight of that term."""
-    margin: float = Field(default=0.1, ge=0)
-    """Margin of "dqfd" and "sdqfd" between demonstrated actions and others."""
-    first_beta: float = Field(default=100.0, gt=0)
-    """Inverse temperature of "adet" at the first level; reference implementation."""
-    later_beta: float = Field(default=1.0, gt=0)
-    """Inverse temperature of "adet" at later levels; reference implementation."""
-    learning_rate: float = Field(default=1e-4, gt=0, le=1e3)
-    weight_decay: float = Field(default=1e-5, ge=0)
-    gradient_clamp: float | None = Field(default=1.0, gt=0)
-    """Bound of each element of the gradient; reference implementation."""
+    imitation: SpatialImitation = Margin(name="sdqfd")
+    """The term on demonstrated actions."""
+    optimizer: SpatialOptimizerConfig = SpatialOptimizerConfig()
     gamma: float = Field(default=0.95, gt=0, le=1)
     """Discount factor."""
     batch_size: int = Field(default=16, ge=1)
     target_interval: int = Field(default=100, ge=1)
     """Updates between two copies of the network to its target; reference implementation."""
-    replay: ReplayKind = "symmetric"
+    replay: Replay = Symmetric()
+    rotation: RigidRotation = NoRotation()
+    """Rigid transforms of sampled transitions."""
     epsilon_init: float = Field(default=0.0, ge=0, le=1)
     """Initial probability of a random action; in the appendix, the behaviour policy is greedy."""
     epsilon_end: float = Field(default=0.0, ge=0, le=1)
@@ -65,21 +66,10 @@ class SpatialQConfig(RigidAugmentationConfig):
     """Updates over which that probability changes linearly, those on the demonstrations alone
     included."""
 
-    def without_effect(self, network: NetworkConfig) -> Iterator[str]:
-        """As for `RigidAugmentationConfig`: also fields of other terms on demonstrations."""
-        yield from super().without_effect(network)
-        kind = f"with demonstrations={self.demonstrations!r}"
-        if self.demonstrations == "none":
-            yield from changed(self, ["demonstration_weight"], kind)
-        if self.demonstrations not in ("dqfd", "sdqfd"):
-            yield from changed(self, ["margin"], kind)
-        if self.demonstrations != "adet":
-            yield from changed(self, ["first_beta", "later_beta"], kind)
-
     @property
     def imitates(self) -> Imitation:
         """The executed action, which is on the grid of actions; none without such a term."""
-        return "none" if self.demonstrations == "none" else "executed"
+        return "none" if self.imitation.name == "none" else "executed"
 
     def build(self, network: NetworkConfig, problem: Problem) -> SpatialQ:
         """Return a freshly initialised learner."""
@@ -121,13 +111,9 @@ class SpatialQ(Learner):
         config = self.config
         loss = LevelDQNLoss(
             networks,
-            demonstrations=config.demonstrations,
-            demonstration_weight=config.demonstration_weight,
-            margin=config.margin,
-            first_beta=config.first_beta,
-            later_beta=config.later_beta,
-            weighted_terms=config.importance_weighted,
-            weight_norm=config.importance_norm,
+            demonstrations=config.imitation.name,
+            **config.imitation.loss_options,
+            **config.replay.loss_options,
         )
         return loss.make_value_estimator(gamma=config.gamma)
 
@@ -138,7 +124,7 @@ class SpatialQ(Learner):
 
     def make_transforms(self) -> list[Transform]:
         """Return the rigid transforms of sampled transitions."""
-        return self.config.make_transforms(self.problem, self.images, self.actions)
+        return self.config.rotation.build(self.problem, self.images, self.actions)
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the network's levels can choose."""

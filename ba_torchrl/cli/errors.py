@@ -86,7 +86,7 @@ def name_presets(error: ConfigError, settings: DictConfig) -> None:
         error.instead = hydra_schema.presets_of(error.kind, error.instead)
         return
     fields = {field.split(".")[0] for field, _ in error.problems}
-    for group, field in (("replay", "replay"), ("rotation", "augmentation")):
-        if field in fields and choices.get(group) not in (None, "uniform", "none"):
+    for group in ("replay", "rotation"):
+        if group in fields and choices.get(group) not in (None, "uniform", "none"):
             hint = f"{group}={choices[group]} sets it; this algorithm cannot have it"
-            error.problems.append((field, hint))
+            error.problems.append((group, hint))

@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
-from ba_torchrl.core.config import EnvConfig, env_config_model
+from ba_torchrl.core.config import EnvConfig, env_config_model, parts_of
 from ba_torchrl.demonstrations.formats.base import FORMATS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.camera_views import VIEWS
@@ -101,16 +101,39 @@ def _chosen(values: Mapping[str, Any]) -> list[str]:
 
 
 def _field(name: str, field: FieldInfo, value: Any) -> list[str]:
+    parts = parts_of(field.annotation)
+    if parts and isinstance(value, Mapping) and value.get("name", "") in parts:
+        return _part(name, field, parts, value)
     shown = name
     if not field.is_required() or value not in (None, "???"):
         shown = f"{name}={_short(value)}"
         shown = f"'{shown}'" if isinstance(value, list | tuple | dict) else shown  # for zsh
     choices = _choices(name.split(".")[-1], field.annotation)
     lines = [f"  {shown}" + (f"   {{{', '.join(choices)}}}" if choices else "")]
-    if field.description:
-        text = " ".join(field.description.replace("`", "").split())
-        first = re.split(r"(?<=[^ ]{2}\.) (?=[A-Z\"])", text)[0]
-        lines += _wrapped(" " * _INDENT, first)
+    return lines + _description(field)
+
+
+def _description(field: FieldInfo) -> list[str]:
+    """Return the first sentence of a field's description."""
+    if not field.description:
+        return []
+    text = " ".join(field.description.replace("`", "").split())
+    first = re.split(r"(?<=[^ ]{2}\.) (?=[A-Z\"])", text)[0]
+    return _wrapped(" " * _INDENT, first)
+
+
+def _part(
+    name: str, field: FieldInfo, parts: Mapping[str, type[BaseModel]], value: Mapping[str, Any]
+) -> list[str]:
+    """Return the lines of a field that has fields of its own, those of its choice."""
+    chosen, lines = value.get("name", ""), []
+    if chosen:
+        lines = [f"  {name}.name={chosen}   {{{', '.join(parts)}}}"]
+        lines += _description(field)
+    own = {**hydra_schema.defaults_of(parts[chosen]), **value}
+    for each, inner in parts[chosen].model_fields.items():
+        if each != "name":
+            lines += _field(f"{name}.{each}", inner, own[each])
     return lines
 
 

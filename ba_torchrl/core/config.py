@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
 from pydantic import (
@@ -35,20 +35,52 @@ Which = Literal["best", "latest"]
 
 
 def explain(
-    error: ValidationError, known: Iterable[str], what: str, name: str = ""
+    error: ValidationError,
+    model: type[BaseModel],
+    what: str,
+    known: Iterable[str] | None = None,
+    name: str = "",
 ) -> SettingsError:
-    """Return pydantic's errors as one `SettingsError` that says what is allowed."""
+    """Return pydantic's errors of a model as one `SettingsError` that says what is allowed;
+    arguments as for `parse`."""
     problems = []
     for item in error.errors():
-        field = ".".join(str(part) for part in item["loc"]) or "configuration"
-        if item["type"] == "extra_forbidden":
-            text = str(UnknownNameError("parameter", field, sorted(known)))
+        names, owner, parts = _place(model, item["loc"])
+        field, kind = ".".join(names) or "configuration", item["type"]
+        if kind == "extra_forbidden":
+            is_known, hint = owner is model and known is not None, ""
+            if item["loc"][-2:-1] and item["loc"][-2] in parts:  # the name of a choice
+                key = ".".join([*names[:-1], "name"])
+                others = [each for each, part in parts.items() if names[-1] in part.model_fields]
+                hint = f" ({key}={' or '.join(others)} has it)" if others else ""
+            fields = known if is_known else (owner or model).model_fields
+            text = str(UnknownNameError("parameter", field, sorted(fields), hint))
+        elif kind == "union_tag_invalid":
+            text = str(UnknownNameError(f"{field}.name", item["ctx"]["tag"], parts))
+        elif kind in ("union_tag_not_found", "model_attributes_type") and parts:
+            text = f"{field}.name is missing; known: {', '.join(parts)}"
         else:
             message = item["msg"].removeprefix("Value error, ")
             given = repr(item["input"])
             text = f"{field}: {message}" + (f" (got {given})" if len(given) < 80 else "")
         problems.append((field, text))
     return SettingsError(what, name, problems)
+
+
+def _place(model: Any, loc: Iterable[Any]) -> tuple[list[str], Any, Mapping[str, Any]]:
+    """Return the names of an error's place as they are written, the model that has the last of
+    them, and the choices there, of which the model is one or the field has one."""
+    names: list[str] = []
+    owner, parts = model, {}
+    for step in loc:
+        if step in parts:  # pydantic's name for the choice
+            model = parts[step]
+            continue
+        names.append(str(step))
+        owner, field = model, model.model_fields.get(step) if model else None
+        parts = parts_of(field.annotation) if field else parts if owner else {}
+        model = next(iter(parts.values())) if len(parts) == 1 else None
+    return names, owner, parts
 
 
 Model = TypeVar("Model", bound=BaseModel)
@@ -76,8 +108,7 @@ def parse(
     try:
         return model.model_validate(values)
     except ValidationError as error:
-        known = model.model_fields if known is None else known
-        raise explain(error, known, what, name) from None
+        raise explain(error, model, what, known, name) from None
 
 
 def _take_any_sequence(schema: Any) -> None:
@@ -113,6 +144,28 @@ class StrictModel(BaseModel):
         schema = handler(source)
         _take_any_sequence(schema)
         return schema
+
+
+class Part(StrictModel):
+    """One of the choices for a part of an algorithm; a Literal `name` tells them apart."""
+
+    name: str
+
+
+def names_of(part: type[Part]) -> tuple[str, ...]:
+    """Return the names that choose a part."""
+    return get_args(part.model_fields["name"].annotation)
+
+
+def parts_of(annotation: Any) -> dict[str, type[BaseModel]]:
+    """Return the models that a field can have, by the `name` of a choice; "" if it has none."""
+    found = get_args(annotation) or [annotation]
+    models = [each for each in found if isinstance(each, type) and issubclass(each, BaseModel)]
+    return {
+        name: each
+        for each in models
+        for name in (names_of(each) if issubclass(each, Part) else [""])
+    }
 
 
 def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:

@@ -239,7 +239,7 @@ class ExperimentConfig(WorkerOptions):
         option = config.algorithm_config.pretraining_option
         if option is not None and not config.pretrain_updates:
             raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
-        capacity = config.algorithm_config.buffer_size
+        capacity = config.algorithm_config.replay.capacity
         if config.min_replay > capacity:
             raise ConfigError(
                 f"min_replay: {config.min_replay} transitions are more than the replay holds "
@@ -294,8 +294,6 @@ class ExperimentConfig(WorkerOptions):
         option = self.algorithm_config.pretraining_option
         if option is not None and self.pretrain_updates == self.total_updates:
             yield from changed(self, ["compile_mode"], f"without updates after those of {option}")
-        for message in self.algorithm_config.without_effect(self.network_config):
-            yield f"algorithm.{message}"
 
     def _check_reward(self) -> None:
         env, gamma = self.resolved_env.config, getattr(self.algorithm_config, "gamma", None)

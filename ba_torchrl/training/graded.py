@@ -49,7 +49,7 @@ MOST_UPDATES = 2000
 _EVERY, _SELECTION_EPISODES = 32, 50
 _MEDIUM: dict[str, dict[str, Any]] = {
     "close_loop": {
-        "algorithm": {"name": "bc", "batch_size": 32, "policy_average": 0.95},
+        "algorithm": {"name": "bc", "batch_size": 32, "optimizer": {"policy_average": 0.95}},
         "network": {
             "name": "cnn",
             "width": 0.5,
@@ -60,7 +60,7 @@ _MEDIUM: dict[str, dict[str, Any]] = {
         },
     },
     "open_loop": {
-        "algorithm": {"name": "bc", "batch_size": 16, "policy_average": 0.95},
+        "algorithm": {"name": "bc", "batch_size": 16, "optimizer": {"policy_average": 0.95}},
         "network": {
             "name": "asr",
             "width": 0.25,

@@ -22,7 +22,7 @@ from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.config import EnvConfig, Part
 from ba_torchrl.core.errors import UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.core.registry import Registry
@@ -39,12 +39,19 @@ _is_complete = [False]
 
 
 def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
-    """Return the fields of a model that have a default, as plain values."""
+    """Return the fields of a model that have a default, as plain values: of a part that is chosen
+    by its name, those that differ from the choice's own defaults."""
     return {
-        name: field.get_default(call_default_factory=True)
+        name: _plain(field.get_default(call_default_factory=True))
         for name, field in model.model_fields.items()
         if not field.is_required()
     }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Part):
+        return {"name": value.name, **value.model_dump(exclude_defaults=True)}
+    return value.model_dump() if isinstance(value, BaseModel) else value
 
 
 @functools.cache
@@ -77,7 +84,7 @@ def register(arguments: Sequence[str] = ()) -> None:
         for name in registry:
             node = OmegaConf.create({"name": name, **defaults_of(registry[name])})
             for field in node:
-                if OmegaConf.is_dict(node[field]):  # open: its entries are those of another program
+                if OmegaConf.is_dict(node[field]):  # open: the model checks its entries
                     OmegaConf.set_struct(node[field], False)
             store.store(group=f"{group}/schema", name=name, node=node)
             if registry.plugin_module(name) is not None:
@@ -164,7 +171,7 @@ def preset(group: str, name: str) -> dict[str, Any]:
     overrides, parts = [f"+{group}={first}"], name.removeprefix(first).split("_")[1:]
     if first in ("rad", "drq", "ferm") and parts[:1] in (["sac"], ["sacfd"]):
         is_plain = parts.pop(0) == "sac"
-        overrides += ["algorithm.demonstration_weight=0.0"] if is_plain else []
+        overrides += ["algorithm.imitation.name=none"] if is_plain else []
     for other in ("replay", "rotation") if group == "algorithm" else ():
         if parts and parts[0] in preset_names(other):
             overrides.append(f"+{other}={parts.pop(0)}")

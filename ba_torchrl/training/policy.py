@@ -464,7 +464,7 @@ def read_card(path: str | Path) -> PolicyCard:
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror}") from None
     except ValidationError as error:
-        found = explain(error, PolicyCard.model_fields, "card")
+        found = explain(error, PolicyCard, "card")
         raise ConfigError(f"this version cannot use {file}: {found}") from None
 
 

@@ -52,15 +52,14 @@ CLOSE_LOOP = {
     "task": "close_loop/block_picking",
     "algorithm": {
         "name": "sac",
-        "demonstration_weight": 1.0,
         "batch_size": 64,
-        "replay": "prioritized",
-        "augmentation": "so2",
+        "replay": {"name": "prioritized"},
+        "rotation": {"name": "sampled"},
     },
 }
 OPEN_LOOP = {
     "task": "open_loop/block_stacking",
-    "algorithm": {"name": "spatial_q", "demonstrations": "sdqfd", "batch_size": 16},
+    "algorithm": {"name": "spatial_q", "batch_size": 16},
 }
 SIX_DOF = {**OPEN_LOOP, "env": {"action_sequence": "pxyzrrr", "in_hand_mode": "proj"}}
 

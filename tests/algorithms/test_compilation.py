@@ -14,11 +14,11 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.checkpoint import read_config
 from tests.algorithms import tiny
-from tests.algorithms.tiny import FERM, SIX_DOF, make_experiment, run, transitions
+from tests.algorithms.tiny import FERM, PER, SIX_DOF, SO2, make_experiment, run, transitions
 
 FLOAT32 = {"precision": "float32"}
-SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
-SDQFD = {"demonstrations": "sdqfd", "replay": "prioritized"}
+SACFD = {"replay": PER, "rotation": SO2}
+SDQFD = {"replay": PER}
 
 
 @pytest.fixture(autouse=True)

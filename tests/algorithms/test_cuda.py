@@ -8,11 +8,11 @@ from tqdm import tqdm
 from profiling import learning
 from profiling.table import Bench, Budget
 from tests.algorithms import tiny
-from tests.algorithms.tiny import OPEN, make_experiment, run, transitions
+from tests.algorithms.tiny import OPEN, PER, SO2, make_experiment, run, transitions
 
 pytestmark = pytest.mark.cuda
 
-SACFD = {"name": "sac", "demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
+SACFD = {"name": "sac", "replay": PER, "rotation": SO2}
 
 
 def build(network, device, algorithm="sac", **settings):
@@ -30,11 +30,11 @@ def parameters(learner):
     [
         ("cnn", SACFD, {}),
         ("equi", SACFD, {}),
-        ("cnn", {"name": "rlpd", "replay": "symmetric"}, {}),
+        ("cnn", {"name": "rlpd", "replay": {"name": "symmetric"}}, {}),
         ("cnn", {"name": "iql"}, {"pretrain_updates": 1}),
         ("cnn", {"name": "bc"}, {}),
         ("cnn", {"name": "dagger"}, {}),
-        ("asr", {"name": "spatial_q", "demonstrations": "sdqfd"}, OPEN),
+        ("asr", {"name": "spatial_q"}, OPEN),
     ],
     ids=["sacfd cnn", "sacfd equi", "rlpd", "iql", "bc", "dagger", "sdqfd asr"],
 )

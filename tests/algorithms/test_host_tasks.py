@@ -6,10 +6,10 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from ba_torchrl.algorithms.host_tasks import HostTasks
 from ba_torchrl.core import keys
-from tests.algorithms.tiny import FERM, SIX_DOF, build, network_config, transitions
+from tests.algorithms.tiny import FERM, PER, SIX_DOF, SO2, build, network_config, transitions
 
 CPU = torch.device("cpu")
-SACFD = {"demonstration_weight": 1.0, "replay": "prioritized", "augmentation": "so2"}
+SACFD = {"replay": PER, "rotation": SO2}
 
 
 def deferred(algorithm="sac", network="cnn", **settings):
@@ -147,10 +147,10 @@ class ReadsOnTheHost(TorchDispatchMode):
     ("algorithm", "network", "settings"),
     [
         ("sac", "cnn", SACFD),
-        ("sac", "equi", {**SACFD, "gradient_clamp": 1.0, "policy_average": 0.9}),
-        ("sac", "cnn", {"view_transform": "shift", "views": 2, "target_views": 2}),
-        ("sac", "ferm", {**FERM, "gradient_clamp": 1.0}),
-        ("rlpd", "cnn", {"replay": "symmetric"}),
+        ("sac", "equi", {**SACFD, "optimizer": {"gradient_clamp": 1.0, "policy_average": 0.9}}),
+        ("sac", "cnn", {"views": {"name": "shift", "views": 2, "target_views": 2}}),
+        ("sac", "ferm", {**FERM, "optimizer": {"gradient_clamp": 1.0}}),
+        ("rlpd", "cnn", {"replay": {"name": "symmetric"}}),
         ("bc", "cnn", {}),
         ("dagger", "cnn", {}),
     ],
@@ -185,7 +185,7 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
 def test_losses_of_spatial_networks_read_no_result(network, sequence, kind):
     """Tensors of the device "meta" have no values, and reading one raises an error."""
     pytest.importorskip("escnn")
-    learner = build("spatial_q", network, sequence=sequence, demonstrations=kind)
+    learner = build("spatial_q", network, sequence=sequence, imitation={"name": kind})
     loss = learner.make_loss(learner.make_networks(network_config(network, sequence)).to("meta"))
     terms = loss(transitions(learner, 8).to("meta"))
     sum(terms[key] for key in loss.out_keys if key.startswith("loss_")).backward()
@@ -194,7 +194,7 @@ def test_losses_of_spatial_networks_read_no_result(network, sequence, kind):
 
 def test_priorities_are_set_before_their_transitions_are_overwritten():
     """New transitions get the largest error so far, and no error of those that they replace."""
-    learner = deferred(**SACFD, buffer_size=24)
+    learner = deferred(**{**SACFD, "replay": {"name": "prioritized", "capacity": 24}})
     learner.update()
     assert len(learner.host_tasks) == 2
     learner.extend(transitions(learner)[1::2])  # in place of the 12 that are no demonstrations

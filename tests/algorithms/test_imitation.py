@@ -46,9 +46,7 @@ def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
 @pytest.mark.parametrize("algorithm", ["bc", "dagger"])
 def test_the_imitated_action_is_transformed_with_the_scene(algorithm):
     """The images show a spot at the imitated position, and the executed action is elsewhere."""
-    learner = build(
-        algorithm, "asr", augmentation="cn", augmentation_order=4, batch_size=16, buffer_size=24
-    )
+    learner = build(algorithm, "asr", rotation={"name": "cn", "order": 4}, batch_size=16)
     data = transitions(learner)
     size = data["heightmap"].shape[-1]
     rows, columns = torch.arange(len(data)) + 2, 20 - torch.arange(len(data)) // 2
@@ -70,7 +68,7 @@ def test_the_imitated_action_is_transformed_with_the_scene(algorithm):
 
 
 def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
-    algorithm = {"name": "sac", "init": "bc", "replay": "prioritized", "augmentation": "none"}
+    algorithm = {"name": "sac", "init": "bc", "replay": {"name": "prioritized"}}
     made = make_experiment(
         tmp_path, "cnn", algorithm, total_updates=32, pretrain_updates=30, eval_every=32
     )
@@ -156,8 +154,8 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     [
         ("cnn", {"name": "sac"}, {}, "labelled"),
         ("cnn", {"name": "rlpd"}, {}, "all"),
-        ("cnn", {"name": "iql", "replay": "symmetric"}, {}, "all"),
-        ("asr", {"name": "spatial_q", "demonstrations": "none"}, OPEN, "all"),
+        ("cnn", {"name": "iql", "replay": {"name": "symmetric"}}, {}, "all"),
+        ("asr", {"name": "spatial_q", "imitation": {"name": "none"}}, OPEN, "all"),
         ("asr", {"name": "spatial_q"}, OPEN, "expert's"),
     ],
     ids=["sac", "rlpd", "iql", "dqn", "sdqfd"],
@@ -191,7 +189,8 @@ def test_a_cloned_policy_explores():
     """Without the entropy term, its standard deviation tends to zero."""
 
     def entropy(weight):
-        learner = build("sac", init="bc", batch_size=24, learning_rate=3e-3, alpha_init=weight)
+        steps = {"batch_size": 24, "optimizer": {"learning_rate": 3e-3}}
+        learner = build("sac", init="bc", alpha_init=weight, **steps)
         learner.extend(transitions(learner))
         return [float(learner.pretrain_update()["entropy"]) for _ in range(60)][-1]
 
@@ -215,9 +214,9 @@ def demonstration_error(learner):
         ("cnn", {"name": "bc"}, {"demonstrations": 0}, "learns from demonstrations only"),
         ("cnn", {"name": "sac", "init": "bc"}, {}, "pretrain_updates"),
         ("asr", {"name": "spatial_q", "init": "bc"}, {**OPEN, "pretrain_updates": 1}, "no actor"),
-        ("cnn", {"name": "bc", "replay": "prioritized"}, {}, "replay"),
+        ("cnn", {"name": "bc", "replay": {"name": "prioritized"}}, {}, "replay"),
         ("asr", {"name": "bc"}, {}, "network 'asr' is for open_loop"),
-        ("cnn", {"name": "dagger", "augmentation": "cn"}, {}, "algorithm.augmentation: 'cn'"),
+        ("cnn", {"name": "dagger", "rotation": {"name": "cn"}}, {}, "rotation.name: 'cn'"),
     ],
 )
 def test_what_cannot_run_is_refused(tmp_path, network, algorithm, changes, message):

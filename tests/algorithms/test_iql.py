@@ -15,9 +15,7 @@ UNUSUAL = {
     "gamma": 0.7,
     "tau": 0.3,
     "batch_size": 6,
-    "learning_rate": 0.003,
-    "weight_decay": 0.02,
-    "buffer_size": 55,
+    "optimizer": {"learning_rate": 0.003, "weight_decay": 0.02},
 }
 
 

@@ -18,15 +18,14 @@ from tests.algorithms.tiny import FERM, build, transitions
 RATE, WEIGHT, TAU, ENCODER_TAU = 3e-3, 0.5, 0.2, 0.4
 SETTINGS = {
     **FERM,
-    "contrastive_weight": WEIGHT,
-    "learning_rate": RATE,
+    "contrastive": {"name": "info_nce", "weight": WEIGHT, "pretraining": "contrastive"},
     "tau": TAU,
     "encoder_tau": ENCODER_TAU,
 }
 
 
-def ferm(**settings):
-    learner = build("sac", "ferm", **SETTINGS, **settings)
+def ferm(**optimizer):
+    learner = build("sac", "ferm", **SETTINGS, optimizer={"learning_rate": RATE, **optimizer})
     learner.extend(transitions(learner))
     return learner
 
@@ -58,7 +57,7 @@ def update_by_hand(loss, batch, optimizers, clamp, *, pretrains):
 
 @pytest.mark.parametrize("clamp", [None, 0.02])
 def test_ferm_takes_the_steps_of_three_optimisers(clamp):
-    learner, other = (ferm(gradient_clamp=clamp, pretraining="contrastive") for _ in range(2))
+    learner, other = (ferm(gradient_clamp=clamp) for _ in range(2))
     loss = other.loss
     named = dict(loss.named_parameters())
     similarity = named.pop("contrastive.weight")
@@ -86,7 +85,7 @@ def test_ferm_takes_the_steps_of_three_optimisers(clamp):
 
 
 def test_every_learning_rate_follows_the_schedule_of_the_run():
-    learner = ferm(learning_rate_end_factor=0.1, pretraining="contrastive")
+    learner = ferm(learning_rate_end_factor=0.1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for number, expected in enumerate(torch.linspace(RATE, RATE / 10, 11).tolist()):
@@ -173,7 +172,7 @@ def learners(network="cnn", **settings):
     ids=["default", "mixed precision"],
 )
 def test_a_learner_takes_a_stepper_of_torchrl(make):
-    learner, other, expected = learners(replay="prioritized")
+    learner, other, expected = learners(replay={"name": "prioritized"})
     learner.stepper = make(learner)
     found = updated(learner, lambda batch: learner.minimize(batch, learner.stages))
     assert all(torch.equal(one, two) for one, two in zip(found, expected, strict=True))
@@ -190,7 +189,7 @@ def test_a_learner_takes_a_stepper_of_torchrl(make):
 
 def test_a_trainer_of_torchrl_takes_the_optimisers():
     settings = {"learning_rate_end_factor": 0.1, "gradient_clamp": 0.01, "weight_decay": 0.1}
-    learner, _, expected = learners(**settings)
+    learner, _, expected = learners(optimizer=settings)
     trainer = Trainer(
         collector=SimpleNamespace(state_dict=dict),
         total_frames=1,
@@ -204,4 +203,4 @@ def test_a_trainer_of_torchrl_takes_the_optimisers():
     found = updated(learner, trainer.optim_steps)
     assert all(torch.equal(one, two) for one, two in zip(found, expected, strict=True))
     rate = trainer.state_dict()["optimization_stepper"]["optimizer"]["param_groups"][0]["lr"]
-    assert rate < learner.config.learning_rate
+    assert rate < learner.config.optimizer.learning_rate

@@ -11,7 +11,7 @@ ALGORITHMS = ["sac", "bc", "rlpd", "iql"]
 
 
 def averaged(name, decay=0.5):
-    learner = build(name, policy_average=decay, batch_size=8)
+    learner = build(name, optimizer={"policy_average": decay}, batch_size=8)
     learner.extend(transitions(learner))
     return learner
 

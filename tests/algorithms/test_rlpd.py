@@ -13,7 +13,7 @@ from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from tests.algorithms.tiny import build, problem, run, transitions
 
 UNUSUAL = {
-    "learning_rate": 0.003,
+    "optimizer": {"learning_rate": 0.003},
     "tau": 0.3,
     "critics": 5,
     "subset": 3,
@@ -78,7 +78,7 @@ def test_what_cannot_be_built_is_refused():
     with pytest.raises(ConfigError, match="batch_size must be at least 2"):
         build("rlpd", batch_size=1)
     with pytest.raises(ConfigError, match="replay"):
-        parse(ALGORITHMS["rlpd"], {"replay": "uniform"}, "rlpd")
+        parse(ALGORITHMS["rlpd"], {"replay": {"name": "uniform"}}, "rlpd")
 
 
 def test_a_network_without_an_ensemble_is_refused():
@@ -101,7 +101,8 @@ def test_two_iterations_of_a_run(tmp_path):
 @pytest.mark.parametrize(("init", "pretrained"), [("random", 0), ("bc", 3)])
 def test_the_learning_rate_ends_with_the_run(init, pretrained):
     """An update of behaviour cloning is one step, one of RLPD several."""
-    settings = {**UNUSUAL, "learning_rate_end_factor": 0.1, "init": init}
+    schedule = {"learning_rate": 0.003, "learning_rate_end_factor": 0.1}
+    settings = {**UNUSUAL, "optimizer": schedule, "init": init}
     config = parse(ALGORITHMS["rlpd"], settings, "rlpd")
     task = dataclasses.replace(problem(), total_updates=6, pretrain_updates=3)
     learner = config.build(CNNConfig(width=0.25), task)

@@ -15,7 +15,7 @@ DEPTH_M = 0.39
 
 
 def build(network="cnn", **config):
-    options = {"batch_size": 16, "buffer_size": 500, "replay": "prioritized", "augmentation": "so2"}
+    options = {"batch_size": 16, "replay": {**tiny.PER, "capacity": 500}, "rotation": tiny.SO2}
     return tiny.build("sac", network, **{**options, **config})
 
 
@@ -81,7 +81,7 @@ def test_the_acting_policy_follows_the_learner(demonstrations):
 
 
 def test_updates_change_priorities_and_counter_and_imitate(demonstrations):
-    sac = build(learning_rate=3e-3)
+    sac = build(optimizer={"learning_rate": 3e-3})
     sac.extend(demonstrations)
     assert sac.replay_size == len(demonstrations)
     sampler = sac.replay.sampler

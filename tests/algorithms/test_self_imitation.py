@@ -6,6 +6,8 @@ import torch
 from ba_torchrl.core import keys
 from tests.algorithms.tiny import build, make_experiment, transitions
 
+SUCCESSES = {"name": "successes"}
+
 
 def collected(learner, done, success):
     """A step of two environments that begin an episode or are in its second step."""
@@ -21,7 +23,7 @@ def collected(learner, done, success):
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
-    learner = build("sac", imitate_successes=True, batch_size=4, replay=replay)
+    learner = build("sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay})
     data = collected(learner, [True, False], [True, False])
     learner.extend(learner.to_transitions(data, is_demonstration=False))
     assert learner.replay_size == 1
@@ -32,13 +34,13 @@ def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     learner.extend(learner.to_transitions(data, is_demonstration=False))
     assert learner.replay_size == 3
     assert len(learner.episodes) == 1
-    other = build("sac", imitate_successes=True, batch_size=4, replay=replay)
+    other = build("sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay})
     other.load_replay_state(learner.replay_state())
     assert (other.replay_size, len(other.episodes)) == (3, 1)
 
 
 def test_successes_are_imitated_where_the_expert_would_act_otherwise():
-    learner = build("sac", imitate_successes=True, batch_size=4)
+    learner = build("sac", imitation=SUCCESSES, batch_size=4)
     data = collected(learner, [True, True], [True, False])
     data[keys.EXPERT_ACTION] = -data[keys.ACTION]
     stored = learner.to_transitions(data, is_demonstration=False)
@@ -48,7 +50,9 @@ def test_successes_are_imitated_where_the_expert_would_act_otherwise():
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_successes_fill_at_most_half_of_the_replay(replay):
-    learner = build("sac", imitate_successes=True, batch_size=4, replay=replay, buffer_size=8)
+    learner = build(
+        "sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay, "capacity": 8}
+    )
     data = collected(learner, [True, True], [True, True])
     for stored in (2, 4, 6, 8, 10):
         learner.extend(learner.to_transitions(data, is_demonstration=False))
@@ -68,7 +72,7 @@ def test_without_the_option_transitions_are_stored_at_once():
     "collector", ["single", pytest.param("multi_sync", marks=pytest.mark.slow)]
 )
 def test_a_run_stores_whole_episodes(tmp_path, collector):
-    algorithm = {"name": "sac", "imitate_successes": True}
+    algorithm = {"name": "sac", "imitation": SUCCESSES}
     settings = {"collector": {"name": collector}, "total_updates": 20, "eval_every": 20}
     experiment = make_experiment(tmp_path, "cnn", algorithm, **settings)
     experiment.run()

@@ -25,7 +25,7 @@ ENV = {"obs_size": 32, "num_objects": 2}
 
 def build(network="asr", sequence=None, *, seed=0, **config):
     units = {"precision": "float32", "height_scale_m": 0.05, "voxel_scale": 10.0}
-    options = {"batch_size": 4, "buffer_size": 500, **config}
+    options = {"batch_size": 4, **config}
     on = tiny.problem(network, sequence, seed=seed)
     return tiny.build("spatial_q", network, sequence=sequence, sizes=units, on=on, **options)
 
@@ -60,7 +60,8 @@ def demonstration_error(algorithm, data):
 
 @pytest.mark.parametrize("network", ["asr", "fcn", "rot_fcn", "equi_asr", "equi_fcn"])
 def test_every_network_learns_the_demonstrations(network, transitions):
-    algorithm = build(network, learning_rate=1e-3, demonstration_weight=10.0)
+    imitation = {"name": "sdqfd", "weight": 10.0}
+    algorithm = build(network, optimizer={"learning_rate": 1e-3}, imitation=imitation)
     algorithm.extend(transitions)
     before = demonstration_error(algorithm, transitions)
     for _ in range(40):
@@ -81,8 +82,9 @@ def test_networks_of_six_degrees_of_freedom_learn_the_demonstrations(
     network, demonstrations, augmentation, pose_episodes
 ):
     pytest.importorskip("escnn")
-    options = {"demonstrations": demonstrations, "augmentation": augmentation}
-    algorithm = build(network, SIX_DOF, learning_rate=1e-3, demonstration_weight=10.0, **options)
+    imitation = {"name": demonstrations, "weight": 10.0}
+    options = {"imitation": imitation, "rotation": {"name": augmentation}}
+    algorithm = build(network, SIX_DOF, optimizer={"learning_rate": 1e-3}, **options)
     algorithm.on_demonstrations(pose_episodes)
     data = to_transitions(pose_episodes)
     before = demonstration_error(algorithm, data)
@@ -122,11 +124,11 @@ def test_the_policy_is_greedy_unless_epsilon_is_positive(transitions):
 
 
 def test_a_restored_learner_continues_identically(transitions):
-    first = build(target_interval=3, augmentation="se2")
+    first = build(target_interval=3, rotation={"name": "se2"})
     first.extend(transitions)
     for _ in range(4):
         first.update()
-    second = build(target_interval=3, augmentation="se2", seed=5)
+    second = build(target_interval=3, rotation={"name": "se2"}, seed=5)
     second.load_state_dict(copy.deepcopy(first.state_dict()))
     second.load_replay_state(copy.deepcopy(first.replay_state()))
     assert second.updates == 4
@@ -146,7 +148,7 @@ def test_an_action_without_yaw_supports_networks_without_yaw_only(transitions):
     with pytest.raises(ValueError, match="fcn"):
         build("asr", "pxy")
     with pytest.raises(ValueError, match="no yaw"):
-        build("fcn", "pxy", augmentation="se2")
+        build("fcn", "pxy", rotation={"name": "se2"})
 
 
 def test_networks_and_tasks_of_the_other_control_are_refused():

@@ -47,12 +47,13 @@ PAIRS = [
 
 
 def build(preset, network, **changes):
-    values = {**method(preset), **changes, "batch_size": 4, "buffer_size": 60}
+    values = {**method(preset), **changes, "batch_size": 4}
+    values["replay"] = {**values["replay"], "capacity": 60}
     sequence = tiny.SIX_DOF if network == "6d_asr" else None
     network = network.removeprefix("6d_")
     problem = tiny.problem(network, sequence)
-    if values.get("view_transform") == "crop":
-        values["crop_size"] = CROP
+    if values.get("views", {}).get("name") == "crop":
+        values["views"] = {**values["views"], "size": CROP}
         problem = replace(problem, images=close_loop_images(IMAGE))
     return tiny.build(values.pop("name"), network, sequence=sequence, on=problem, **values)
 
@@ -99,7 +100,7 @@ def test_a_restored_learner_continues_the_same_views(preset):
 
 
 def test_the_options_reach_augmentation_loss_and_target_update():
-    drq = build("drq", "cnn", shift_pixels=3, views=3)
+    drq = build("drq", "cnn", views={"name": "shift", "pixels": 3, "views": 3, "target_views": 2})
     (augmentation,) = drq.replay.transform
     assert isinstance(augmentation, RandomViews)
     assert (augmentation.padding, augmentation.views, augmentation.target_views) == (3, 3, 2)
@@ -112,12 +113,12 @@ def test_the_options_reach_augmentation_loss_and_target_update():
     assert isinstance(ferm.target_updater, SoftUpdateByNetwork)
     assert ferm.target_updater.tau == 0.1
     assert ferm.target_updater.taus == {"encoder_network_params": 0.2}
-    both = build("rad", "cnn", augmentation="so2")
+    both = build("rad", "cnn", rotation={"name": "sampled"})
     assert [type(each) for each in both.replay.transform] == [SO2Augmentation, RandomViews]
 
 
 def test_contrastive_pretraining_trains_the_encoder_only():
-    ferm = build("ferm", "ferm", learning_rate=3e-4)
+    ferm = build("ferm", "ferm", optimizer={"learning_rate": 3e-4})
     ferm.extend(transitions(ferm))
     before = parameters(ferm)
     scalars = ferm.pretrain_update()
@@ -163,7 +164,8 @@ def test_imitation_trains_the_convolutions_of_ferm(preset):
 
 @pytest.mark.parametrize(("pretraining", "share"), [("contrastive", 0.0), ("all", 4 / 10)])
 def test_importance_weights_start_with_the_losses_of_the_algorithm(pretraining, share, monkeypatch):
-    ferm = build("ferm_per", "ferm", pretraining=pretraining)
+    contrastive = {"name": "info_nce", "pretraining": pretraining}
+    ferm = build("ferm_per", "ferm", contrastive=contrastive)
     ferm.problem = replace(ferm.problem, pretrain_updates=4)
     ferm.extend(transitions(ferm))
     seen, sampler = [], ferm.replay.sampler
@@ -264,7 +266,7 @@ def test_the_acting_policy_sees_the_centre_of_larger_images():
 
 
 def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
-    stored = build("sacfd_so2", "cnn", stored_copies=4)
+    stored = build("sacfd_so2", "cnn", rotation={"name": "stored"})
     assert isinstance(stored, SAC)
     data = transitions(stored)
     stored.extend(data)
@@ -279,10 +281,14 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"views": 2}, "need view_transform"),
-        ({"contrastive_weight": 1.0}, "need view_transform"),
-        ({"pretraining": "contrastive"}, "needs contrastive_weight"),
-        ({"stored_copies": 4}, "stored_copies needs augmentation"),
+        ({"contrastive": {"name": "info_nce"}}, "compares views: set views.name"),
+        ({"views": {"pixels": 2}}, "views.name is missing; known: none, crop, shift"),
+        ({"views": {"name": "shft"}}, "unknown views.name 'shft'. Did you mean 'shift'"),
+        (
+            {"views": {"name": "crop", "pixels": 2}},
+            r"'views.pixels'. Known: name, size, target_views, views \(views.name=shift has it\)",
+        ),
+        ({"views": {"name": "shift", "pixels": 0}}, "  views.pixels: Input should be greater"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(changes, message):
@@ -292,6 +298,6 @@ def test_options_that_do_not_go_together_are_refused(changes, message):
 
 def test_a_crop_larger_than_the_image_is_refused():
     problem = build("sac", "cnn").problem
-    settings = parse(ALGORITHMS["sac"], {"view_transform": "crop", "crop_size": 128}, "sac")
-    with pytest.raises(ConfigError, match=r"crop_size=128: .* only 64 px"):
+    settings = parse(ALGORITHMS["sac"], {"views": {"name": "crop", "size": 128}}, "sac")
+    with pytest.raises(ConfigError, match=r"views.size=128: .* only 64 px"):
         settings.build(parse(NETWORKS["cnn"], {}, "cnn"), problem)

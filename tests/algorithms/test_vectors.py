@@ -13,7 +13,7 @@ from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demon
 from tests.algorithms import tiny
 
 SIZES = {"proprio": 8, "joints": 7}
-DRQ = {"view_transform": "shift", "views": 2, "target_views": 2}
+DRQ = {"views": {"name": "shift", "views": 2, "target_views": 2}}
 
 
 def build(network="cnn", vectors=tuple(SIZES), algorithm="sac", observed=SIZES, **settings):
@@ -67,9 +67,9 @@ def test_the_contrastive_loss_does_not_compare_vectors():
 def test_what_does_not_fit_is_refused():
     with pytest.raises(ConfigError, match=r"does not observe proprio; it observes no vectors"):
         build(vectors=("proprio",), observed={})
-    for option in ({}, {"stored_copies": 2}):
+    for rotation in ("sampled", "stored"):
         with pytest.raises(ConfigError, match="not the network's vectors \\(proprio\\)"):
-            build(vectors=("proprio",), augmentation="so2", **option)
+            build(vectors=("proprio",), rotation={"name": rotation})
 
 
 def test_a_run_stores_demonstrations_with_vectors_and_its_policy_is_loaded(tmp_path, monkeypatch):

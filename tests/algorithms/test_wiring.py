@@ -17,64 +17,43 @@ from tests.algorithms import tiny
 from tests.algorithms.tiny import make_experiment, transitions
 
 SAC = {
-    "learning_rate": 0.003,
-    "weight_decay": 0.02,
-    "gradient_clamp": 1e-4,
+    "optimizer": {"learning_rate": 0.003, "weight_decay": 0.02, "gradient_clamp": 1e-4},
     "gamma": 0.7,
     "tau": 0.3,
     "alpha_init": 0.25,
     "target_entropy": -2.5,
     "entropy_backup": False,
-    "demonstration_weight": 3.0,
+    "imitation": {"name": "demonstrations", "weight": 3.0},
     "exploration_noise": 0.15,
     "batch_size": 6,
-    "buffer_size": 77,
-    "replay": "prioritized",
-    "priority_exponent": 0.9,
-    "importance_exponent": 0.2,
-    "importance_weighted": "all",
-    "importance_norm": "mean",
-    "expert_bonus": 2.5,
-    "augmentation": "so2",
-    "augmentation_probability": 0.35,
+    "replay": {
+        "name": "prioritized",
+        "capacity": 77,
+        "priority_exponent": 0.9,
+        "importance_exponent": 0.2,
+        "weighted_terms": "all",
+        "weight_norm": "mean",
+        "expert_bonus": 2.5,
+    },
+    "rotation": {"name": "sampled", "probability": 0.35},
 }
 SPATIAL_Q = {
-    "learning_rate": 0.002,
-    "weight_decay": 0.03,
-    "gradient_clamp": 1e-4,
+    "optimizer": {"learning_rate": 0.002, "weight_decay": 0.03, "gradient_clamp": 1e-4},
     "gamma": 0.6,
-    "demonstrations": "adet",
-    "demonstration_weight": 0.7,
-    "first_beta": 7.0,
-    "later_beta": 3.0,
+    "imitation": {"name": "adet", "weight": 0.7, "first_beta": 7.0, "later_beta": 3.0},
     "target_interval": 3,
     "batch_size": 6,
-    "buffer_size": 55,
-    "replay": "symmetric",
-    "importance_weighted": "critic",
-    "importance_norm": "mean",
-    "augmentation": "cn",
-    "augmentation_probability": 0.45,
-    "augmentation_order": 6,
+    "replay": {"name": "symmetric", "capacity": 55},
+    "rotation": {"name": "cn", "probability": 0.45, "order": 6},
     "epsilon_init": 1.0,
     "epsilon_end": 0.2,
     "epsilon_updates": 4,
 }
 KINDS = {"sac": SAC, "spatial_q": SPATIAL_Q}
-OF_PRIORITIES = {
-    "priority_exponent",
-    "importance_exponent",
-    "importance_weighted",
-    "importance_norm",
-    "expert_bonus",
-}
 
 
 def build(name, **changes):
-    values = {**KINDS[name], **changes}
-    if values["replay"] != "prioritized":
-        values = {key: value for key, value in values.items() if key not in OF_PRIORITIES}
-    return tiny.build(name, "cnn" if name == "sac" else "asr", **values)
+    return tiny.build(name, "cnn" if name == "sac" else "asr", **{**KINDS[name], **changes})
 
 
 @pytest.fixture(params=["sac", "spatial_q"])
@@ -128,16 +107,14 @@ def test_the_terms_of_spatial_q_have_their_values():
     assert loss.demonstrations == "adet"
     values = (loss.demonstration_weight, loss.first_beta, loss.later_beta)
     assert values == (0.7, 7.0, 3.0)
-    defaults = {"first_beta": 100.0, "later_beta": 1.0}
-    assert build("spatial_q", demonstrations="dqfd", margin=0.4, **defaults).loss.margin == 0.4
+    assert build("spatial_q", imitation={"name": "dqfd", "margin": 0.4}).loss.margin == 0.4
 
 
 @pytest.mark.parametrize("name", ["sac", "spatial_q"])
 def test_the_loss_has_the_configured_discount_and_importance_weights(name):
-    loss, config = build(name, replay="prioritized").loss, KINDS[name]
-    assert float(loss.value_estimator.gamma) == pytest.approx(config["gamma"])
-    assert loss.weighted_terms == config["importance_weighted"]
-    assert loss.weight_norm == config["importance_norm"]
+    loss = build(name, replay=SAC["replay"]).loss
+    assert float(loss.value_estimator.gamma) == pytest.approx(KINDS[name]["gamma"])
+    assert (loss.weighted_terms, loss.weight_norm) == ("all", "mean")
 
 
 def flat(params):
@@ -146,7 +123,7 @@ def flat(params):
 
 @pytest.mark.parametrize("name", ["qvalue_network", "encoder_network"])
 def test_the_target_of_sac_follows_by_tau_at_every_update(name):
-    sac = build("sac", learning_rate=0.1)
+    sac = build("sac", optimizer={"learning_rate": 0.1})
     sac.extend(transitions(sac))
     online = getattr(sac.loss, f"{name}_params")
     target = getattr(sac.loss, f"target_{name}_params")
@@ -173,7 +150,7 @@ def test_the_target_of_spatial_q_is_copied_at_its_interval():
 
 @pytest.mark.parametrize(("name", "probability"), [("sac", 0.35), ("spatial_q", 0.45)])
 def test_batches_are_augmented_with_the_configured_probability(name, probability):
-    made = build(name, batch_size=400, replay="uniform")
+    made = build(name, batch_size=400, replay={"name": "uniform"})
     made.extend(transitions(made))
     kind = SO2Augmentation if name == "sac" else RigidAugmentation
     (augmentation,) = made.replay.transform
@@ -195,12 +172,12 @@ def test_batches_are_augmented_with_the_configured_probability(name, probability
 def test_the_order_and_kind_of_rigid_transforms_are_the_configured_ones():
     (augmentation,) = build("spatial_q").replay.transform
     assert (augmentation.transforms, augmentation.order) == ("cn", 6)
-    plain = build("sac", augmentation="none", augmentation_probability=0.8)
+    plain = build("sac", rotation={"name": "none"})
     assert not len(plain.replay.transform)
 
 
 def test_weight_decay_applies_to_the_networks_and_not_to_the_temperature(algorithm):
-    config, optimizer = algorithm.config, algorithm.optimizer
+    config, optimizer = algorithm.config.optimizer, algorithm.optimizer
     decay = {
         id(p): group["weight_decay"] for group in optimizer.param_groups for p in group["params"]
     }
@@ -234,7 +211,7 @@ def test_the_replay_has_the_configured_size_batch_and_priorities():
 @pytest.mark.parametrize("name", ["sac", "spatial_q"])
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_every_algorithm_learns_from_every_replay(name, replay):
-    made = build(name, replay=replay)
+    made = build(name, replay={"name": replay})
     made.extend(transitions(made))
     before = flat(dict_of(made))
     made.update()
@@ -259,7 +236,7 @@ def test_the_policy_explores_under_random_and_is_greedy_under_deterministic(algo
 
 @pytest.mark.parametrize("policy_average", [0.0, 0.9])
 def test_epsilon_decreases_over_its_updates(policy_average):
-    spatial = build("spatial_q", policy_average=policy_average)
+    spatial = build("spatial_q", optimizer={"policy_average": policy_average})
     spatial.extend(transitions(spatial))
     shares = []
     for _ in range(6):
@@ -282,7 +259,7 @@ def test_collection_explores_and_evaluation_is_greedy(tmp_path):
 
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
-    spatial = build("spatial_q", replay=replay)
+    spatial = build("spatial_q", replay={"name": replay})
     generators = {"replay": spatial.replay._rng}
     if replay == "symmetric":
         generators = dict(spatial.replay.sampler.generators)

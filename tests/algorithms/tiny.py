@@ -23,7 +23,9 @@ SIZES = {
 }
 SIX_DOF = "pxyzrrr"
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
-FERM = {"view_transform": "shift", "contrastive_weight": 1.0}
+PER = {"name": "prioritized"}
+SO2 = {"name": "sampled"}
+FERM = {"views": {"name": "shift"}, "contrastive": {"name": "info_nce"}}
 """SAC with optimisers of its own for one of the terms of the loss."""
 OPEN = {"task": "open_loop/block_stacking", "env": {"obs_size": 32, "num_objects": 2}}
 """Changes of `run` for an open-loop task."""
@@ -97,7 +99,7 @@ def make_experiment(folder, network, algorithm, **changes):
     values = {
         "task": "close_loop/block_reaching",
         "env": {"obs_size": 64, "max_steps": 6},
-        "algorithm": {"batch_size": 8, "learning_rate": 3e-3, **algorithm},
+        "algorithm": {"batch_size": 8, "optimizer": {"learning_rate": 3e-3}, **algorithm},
         "network": {"name": network, **SIZES[network], **units},
         "num_envs": 2,
         "parallel": False,

@@ -51,7 +51,11 @@ COMMANDS = (
 LONG = 300 * "n"
 REFUSED = [
     ("train", "threads=100000", "threads: Input should be less than or equal to 1024"),
-    ("train", "algorithm.learning_rate=1e300", "learning_rate: Input should be less than"),
+    (
+        "train",
+        "algorithm.optimizer.learning_rate=1e300",
+        "learning_rate: Input should be less than",
+    ),
     ("train", "run_dir=file", "it is not a folder"),
     ("train", "run_dir=/dev/full/x", "cannot write to "),
     ("benchmark", "only=9999", "only: must be a number from 0 to "),
@@ -194,8 +198,8 @@ def test_an_unknown_plugin_on_the_command_line_is_one_line(name, capsys):
             r"pretrain_updates \(30\) is part of total_updates \(20\)",
         ),
         ({"min_replay": 100_001}, "min_replay: 100001 transitions are more than the replay holds"),
-        ({"algorithm": {"name": "sac", "learning_rate": math.inf}}, "learning_rate"),
-        ({"algorithm": {"name": "sac", "learning_rate": math.nan}}, "learning_rate"),
+        ({"algorithm": {"name": "sac", "optimizer": {"learning_rate": math.inf}}}, "learning_rate"),
+        ({"algorithm": {"name": "sac", "optimizer": {"learning_rate": math.nan}}}, "learning_rate"),
         ({"env": {"dpos": 1e30}}, "dpos"),
         ({"env": {"drot": 1e30}}, "drot"),
         ({"env": {"dpos": math.inf}}, "dpos"),
@@ -216,7 +220,7 @@ def test_a_run_that_cannot_work_is_refused(changes, words):
 
 def test_collection_alone_must_reach_the_least_size_of_a_symmetric_replay():
     """Without demonstrations, one of its halves stays empty."""
-    algorithm = {"name": "sac", "replay": "symmetric", "buffer_size": 50}
+    algorithm = {"name": "sac", "replay": {"name": "symmetric", "capacity": 50}}
     ExperimentConfig.parse({**RUN, "algorithm": algorithm, "min_replay": 50})
     with pytest.raises(ConfigError, match=r"than the replay holds \(50\)"):
         ExperimentConfig.parse({**RUN, "algorithm": algorithm, "min_replay": 51})

@@ -106,7 +106,7 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
             ["train", "task=open_loop/block_stacking", "algorithm=dqn", "env.scale=3"],
             "Did you mean 'object_scale_range'?",
         ),
-        (["train", "algorithm.lerning_rate=1"], "Did you mean 'learning_rate'?"),
+        (["train", "algorithm.optimizer.lerning_rate=1"], "Did you mean 'learning_rate'?"),
         (["train", "algorithm=dqn", "algorithm.magrin=1"], "unknown setting 'algorithm.magrin'"),
         (["train", "network.wdith=1", "network=cnn"], "Did you mean 'width'?"),
         (["train", "algorithm=sacd"], "unknown algorithm 'sacd'. Did you mean 'sacfd'?"),

@@ -13,7 +13,11 @@ from ba_torchrl.training.experiment import Experiment
 RUN = {
     "task": "close_loop/block_reaching",
     "env": {"obs_size": 64, "max_steps": 8},
-    "algorithm": {"name": "mine/behaviour_cloning", "batch_size": 16, "learning_rate": 3e-3},
+    "algorithm": {
+        "name": "mine/behaviour_cloning",
+        "batch_size": 16,
+        "optimizer": {"learning_rate": 3e-3},
+    },
     "network": {"name": "cnn", "width": 0.25, "depth_center_m": 0.2, "depth_scale_m": 0.1},
     "num_envs": 2,
     "parallel": False,

@@ -163,7 +163,7 @@ def two_views(env=(), **other):
         {
             "task": "close_loop/block_picking",
             "env": {"obs_size": 64, "max_steps": 10, **dict(env)},
-            "algorithm": {"name": "sac", "batch_size": 8, "augmentation": "none"},
+            "algorithm": {"name": "sac", "batch_size": 8},
             "network": {"name": "mine/two_views"},
             **other,
         }

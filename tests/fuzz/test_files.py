@@ -25,7 +25,7 @@ TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 4}
 RUN = {
     "task": TASK,
     "env": ENV,
-    "algorithm": {"name": "sac", "buffer_size": 20, "batch_size": 4},
+    "algorithm": {"name": "sac", "replay": {"name": "uniform", "capacity": 20}, "batch_size": 4},
     "network": {"name": "cnn", "width": 0.125},
     "num_envs": 1,
     "parallel": False,

@@ -39,10 +39,10 @@ def without_float64(monkeypatch):
     [
         ("sac", "cnn", None, {}),
         ("sac", "equi", None, {}),
-        ("spatial_q", "asr", None, {"demonstrations": "sdqfd"}),
-        ("spatial_q", "asr", None, {"demonstrations": "adet"}),
-        ("spatial_q", "asr", tiny.SIX_DOF, {"demonstrations": "sdqfd"}),
-        ("spatial_q", "equi_deictic_asr", None, {"demonstrations": "sdqfd"}),
+        ("spatial_q", "asr", None, {}),
+        ("spatial_q", "asr", None, {"imitation": {"name": "adet"}}),
+        ("spatial_q", "asr", tiny.SIX_DOF, {}),
+        ("spatial_q", "equi_deictic_asr", None, {}),
     ],
 )
 def test_learners(algorithm, network, sequence, settings, without_float64):

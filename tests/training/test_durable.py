@@ -32,7 +32,11 @@ TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 TINY = {
     "task": TASK,
     "env": ENV,
-    "algorithm": {"name": "sac", "batch_size": 4, "replay": "prioritized", "buffer_size": 50},
+    "algorithm": {
+        "name": "sac",
+        "batch_size": 4,
+        "replay": {"name": "prioritized", "capacity": 50},
+    },
     "network": {"name": "cnn", "width": 0.125},
     "num_envs": 1,
     "parallel": False,

@@ -40,8 +40,8 @@ TINY = {
     "algorithm": {
         "name": "sac",
         "batch_size": 8,
-        "replay": "prioritized",
-        "augmentation": "so2",
+        "replay": {"name": "prioritized"},
+        "rotation": {"name": "sampled"},
     },
     "network": {"name": "cnn", "width": 0.25},
     "num_envs": 2,
@@ -240,9 +240,8 @@ def test_a_folder_without_a_run_is_an_error(tmp_path):
 NO_PRETRAINING = {"pretrain_updates": 0}
 FERM = {
     "name": "sac",
-    "view_transform": "crop",
-    "contrastive_weight": 1.0,
-    "pretraining": "contrastive",
+    "views": {"name": "crop", "size": 64},
+    "contrastive": {"name": "info_nce", "pretraining": "contrastive"},
 }
 
 
@@ -402,9 +401,9 @@ def test_another_view_can_be_used_for_training(tmp_path):
 @pytest.mark.parametrize("view", ["camera_center_xyzr", "camera_side"])
 def test_rotation_is_refused_for_views_that_do_not_rotate_with_the_scene(tmp_path, view):
     env = {**TINY["env"], "view_type": view}
-    with pytest.raises(ConfigError, match=r"depth does not rotate.*use augmentation 'none'"):
+    with pytest.raises(ConfigError, match=r"depth does not rotate.*use rotation.name=none"):
         Experiment(tiny(tmp_path, env=env), progress=False)
-    plain = {**TINY["algorithm"], "augmentation": "none"}
+    plain = {**TINY["algorithm"], "rotation": {"name": "none"}}
     config = tiny(tmp_path, env=env, algorithm=plain, **SHORT)
     assert Experiment(config, progress=False).run().updates == 3
 

@@ -22,7 +22,11 @@ from tests.tasks.episodes import slow
 SAC = {
     "task": "close_loop/block_reaching",
     "env": {"obs_size": 64, "max_steps": 8},
-    "algorithm": {"name": "sac", "batch_size": 4, "replay": "prioritized", "buffer_size": 60},
+    "algorithm": {
+        "name": "sac",
+        "batch_size": 4,
+        "replay": {"name": "prioritized", "capacity": 60},
+    },
     "network": {"name": "cnn", "width": 0.125},
     "num_envs": 2,
     "parallel": False,
@@ -132,7 +136,7 @@ def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, un
 
 @pytest.mark.parametrize("after", [10, *slow([7])])
 def test_unfinished_episodes_of_self_imitation_are_continued(tmp_path, after):
-    algorithm = {**SAC["algorithm"], "imitate_successes": True}
+    algorithm = {**SAC["algorithm"], "imitation": {"name": "successes"}}
     whole = Experiment(config_for(tmp_path / "whole", algorithm=algorithm), progress=False)
     whole.run()
     experiment = Experiment(config_for(tmp_path / "run", algorithm=algorithm), progress=False)

@@ -26,8 +26,8 @@ TINY = {
     "algorithm": {
         "name": "sac",
         "batch_size": 8,
-        "replay": "prioritized",
-        "augmentation": "so2",
+        "replay": {"name": "prioritized"},
+        "rotation": {"name": "sampled"},
     },
     "network": {"name": "cnn", "width": 0.25},
     "num_envs": 2,
@@ -42,14 +42,13 @@ TINY = {
     "log_every": 1,
     "video_episodes": 0,
 }
-UNIFORM = {**TINY["algorithm"], "replay": "uniform"}
+UNIFORM = {**TINY["algorithm"], "replay": {"name": "uniform"}}
 FERM = {
     "algorithm": {
         **UNIFORM,
-        "view_transform": "shift",
-        "contrastive_weight": 1.0,
-        "pretraining": "contrastive",
-        "learning_rate_end_factor": 0.1,
+        "views": {"name": "shift"},
+        "contrastive": {"name": "info_nce", "pretraining": "contrastive"},
+        "optimizer": {"learning_rate_end_factor": 0.1},
     },
     "network": {"name": "ferm", "width": 0.1, "features": 8},
 }
@@ -167,7 +166,7 @@ def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_pa
         for index, moments in state["state"].items():
             for key in ("exp_avg", "exp_avg_sq", "step"):
                 assert torch.equal(restored[name]["state"][index][key], moments[key])
-    if config.algorithm_config.replay == "prioritized":
+    if config.algorithm_config.replay.name == "prioritized":
         a, b = (algorithm.replay.sampler.state_dict() for algorithm in (old, new))
         assert torch.equal(a["leaves"], b["leaves"])
         assert len(set(a["leaves"][: old.replay_size].tolist())) > 3  # not all of them alike

@@ -7,8 +7,6 @@ from ba_torchrl.training.experiment import Experiment
 from tests.algorithms.test_variants import method
 from tests.training.test_experiment import tiny
 
-SMALL = {"batch_size": 4, "buffer_size": 100}
-
 
 @pytest.mark.parametrize(
     ("preset", "network", "obs_size"),
@@ -24,7 +22,7 @@ SMALL = {"batch_size": 4, "buffer_size": 100}
 def test_a_run_collects_learns_and_evaluates(tmp_path, preset, network, obs_size):
     config = tiny(
         tmp_path,
-        algorithm={**method(preset), **SMALL},
+        algorithm={**method(preset), "batch_size": 4},
         network={"name": network, "width": 0.1},
         env={"obs_size": obs_size, "max_steps": 5},
         total_updates=4,

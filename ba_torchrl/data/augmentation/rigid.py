@@ -24,7 +24,7 @@ from ba_torchrl.data.augmentation.so2 import (
 )
 from ba_torchrl.data.transfer import to_device
 
-RigidTransforms = Literal["none", "translation", "cn", "d4", "se2"]
+RigidTransforms = Literal["translation", "cn", "d4", "se2"]
 """Translations; rotations of C_n; quarter turns and reflections; rotations and translations."""
 
 SHIFT_SHARE = 0.05
@@ -124,16 +124,15 @@ class RigidAugmentation(SeededTransform):
             raise ValueError(
                 f"probability must be in [0, 1] and order positive, got {probability}, {order}"
             )
-        if transforms != "none":
-            require_known_frames(images)
-        if transforms not in ("none", "translation"):
+        require_known_frames(images)
+        if transforms != "translation":
             if "rz" not in actions.components:
                 raise ValueError(
-                    f"augmentation {transforms!r} rotates the scene, and the action "
+                    f"{transforms!r} rotates the scene, and the action "
                     f"{actions.sequence!r} has no yaw to rotate with it; use 'translation'"
                 )
             if transforms == "d4" and {"ry", "rx"} & set(actions.components):
-                raise ValueError("augmentation 'd4' reflects the scene, which tilts do not follow")
+                raise ValueError("'d4' reflects the scene, which tilts do not follow")
         self.transforms = transforms
         self.actions = actions
         self.probability = probability
@@ -155,8 +154,6 @@ class RigidAugmentation(SeededTransform):
             tensordict: holds the images, the action and their successors.
         """
         out = self._copied(tensordict)
-        if self.transforms == "none":
-            return out
         others = {keys.ACTION, keys.TARGET_ACTION} - {self._action_key}
         out = out.exclude(*others)
         device = out[self._action_key].device

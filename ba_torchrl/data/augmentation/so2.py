@@ -119,8 +119,8 @@ def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
     unknown = [key for key, image in images.items() if image.frame == "camera"]
     if unknown:
         raise ValueError(
-            f"augmentation: {', '.join(unknown)} does not rotate with the scene and cannot be "
-            "transformed; use augmentation 'none'"
+            f"rotation: {', '.join(unknown)} does not rotate with the scene and cannot be "
+            "transformed; use rotation.name=none"
         )
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
 
 import torch
 from tensordict import TensorDictBase
@@ -19,9 +18,6 @@ from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import SeededTransform, image_pairs
 from ba_torchrl.data.replay.codecs import mapped_bounds
 from ba_torchrl.data.transfer import to_device
-
-ViewTransform = Literal["none", "crop", "shift"]
-"""Random views of an image: parts of it, or the image moved by some pixels."""
 
 
 def take_views(images: Tensor, offsets: Tensor, size: int, padding: int = 0) -> Tensor:
@@ -98,9 +94,9 @@ def cropped_images(images: Mapping[str, ImageSpec], size: int) -> dict[str, Imag
     for key, image in images.items():
         if image.size <= size:
             raise ConfigError(
-                f"crop_size={size}: image {key!r} has only {image.size} px, and random crops are "
+                f"views.size={size}: image {key!r} has only {image.size} px, and random crops are "
                 "smaller than the image (appendix: 128 of 142 px); raise env.obs_size or lower "
-                "algorithm.crop_size"
+                "algorithm.views.size"
             )
     return {key: replace(image, size=size) for key, image in images.items()}
 

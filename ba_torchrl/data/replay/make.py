@@ -27,7 +27,7 @@ def make_replay(
     codecs: Mapping[str, ImageCodec],
     seed: int,
     priority_exponent: float = 0.6,
-    weight_exponent: float = 0.4,
+    importance_exponent: float = 0.4,
     expert_bonus: float = 1.0,
     returns_codes: bool = False,
 ) -> FrameReplayBuffer:
@@ -40,7 +40,8 @@ def make_replay(
         codecs: codec of each image by key; the acting policy must use the same.
         seed: of the draws.
         priority_exponent: alpha of a prioritised replay.
-        weight_exponent: initial beta of a prioritised replay; ``replay.sampler.anneal`` raises it.
+        importance_exponent: initial beta of a prioritised replay, which
+            ``replay.sampler.anneal`` raises.
         expert_bonus: added to the priority of demonstrations.
         returns_codes: samples hold the images' codes instead of decoded images.
     """
@@ -51,7 +52,7 @@ def make_replay(
         sampler = ExpertPrioritizedSampler(
             capacity,
             alpha=priority_exponent,
-            beta=weight_exponent,
+            beta=importance_exponent,
             expert_bonus=expert_bonus,
         )
     return FrameReplayBuffer(

@@ -68,7 +68,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         if not len(places) or excess > len(others):
             raise ConfigError(
                 f"demonstrations fill the replay of {storage.max_size} transitions, and {count} "
-                "more do not fit; raise buffer_size"
+                "more do not fit; raise the capacity"
             )
         is_written = torch.ones(count, dtype=torch.bool, device="cpu")
         is_written[others[:excess]] = False

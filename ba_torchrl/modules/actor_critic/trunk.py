@@ -33,7 +33,7 @@ def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int,
     if image_size not in SUPPORTED_IMAGE_SIZES:
         raise ValueError(
             f"this network takes images of {' or '.join(map(str, SUPPORTED_IMAGE_SIZES))} px, got "
-            f"{image_size}; set obs_size, or crop_size where views are crops"
+            f"{image_size}; set obs_size, or views.size where views are crops"
         )
     paddings, pools = (1, 1, 1, 1, 1, 0, 0), (True, True, True, True, False, True, False)
     stages = list(zip(widths, paddings, pools, strict=True))

@@ -82,7 +82,7 @@ SMALL_RUN: dict[str, Any] = {
     "label": "small",
     "env.obs_size": 64,
     "algorithm.batch_size": 4,
-    "algorithm.buffer_size": 1000,
+    "algorithm.replay.capacity": 1000,
 }
 SMALL_CLOSE_LOOP = {"env.max_steps": 10}
 SMALL_OPEN_LOOP = {"env.max_steps": 6, "algorithm.target_interval": 10}
@@ -121,9 +121,9 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         CLOSE_LOOP_TASK,
         "sac",
         "cnn",
-        {"algorithm__replay": "uniform", "algorithm__augmentation": "none"},
+        {"algorithm__replay__name": "uniform", "algorithm__rotation__name": "none"},
     ),
-    "prioritized sac": (CLOSE_LOOP_TASK, "sac_so2", "cnn", {"algorithm__replay": "prioritized"}),
+    "prioritized sac": (CLOSE_LOOP_TASK, "sac_so2", "cnn", {"replay": "per"}),
     "without yaw": (
         CLOSE_LOOP_TASK,
         "sacfd_per_so2",
@@ -136,9 +136,9 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         "sacfd_per_so2",
         "cnn",
         {
-            "algorithm__learning_rate_end_factor": 0.1,
-            "algorithm__weight_decay": 1e-4,
-            "algorithm__gradient_clamp": 0.1,
+            "algorithm__optimizer__learning_rate_end_factor": 0.1,
+            "algorithm__optimizer__weight_decay": 1e-4,
+            "algorithm__optimizer__gradient_clamp": 0.1,
             "updates_per_step": 2,
         },
     ),
@@ -153,25 +153,25 @@ TRAINING_OPTIONS: dict[str, tuple[str, str, str, dict[str, Any]]] = {
         OPEN_LOOP_TASK,
         "sdqfd",
         "fcn",
-        {"algorithm__replay": "prioritized", "algorithm__augmentation": "se2"},
+        {"algorithm__replay__name": "prioritized", "algorithm__rotation__name": "se2"},
     ),
     "replay prioritized, d4": (
         OPEN_LOOP_TASK,
         "dqfd",
         "asr",
-        {"algorithm__replay": "prioritized", "algorithm__augmentation": "d4"},
+        {"algorithm__replay__name": "prioritized", "algorithm__rotation__name": "d4"},
     ),
     "replay uniform, translation": (
         OPEN_LOOP_TASK,
         "dqn",
         "asr",
-        {"algorithm__replay": "uniform", "algorithm__augmentation": "translation"},
+        {"algorithm__replay__name": "uniform", "algorithm__rotation__name": "translation"},
     ),
     "replay split, cn": (
         OPEN_LOOP_TASK,
         "adet",
         "fcn",
-        {"algorithm__replay": "symmetric", "algorithm__augmentation": "cn"},
+        {"algorithm__replay__name": "symmetric", "algorithm__rotation__name": "cn"},
     ),
     "random actions": (
         OPEN_LOOP_TASK,
@@ -292,7 +292,7 @@ def _choices(method: str) -> dict[str, Any]:
         "replay": "per" if "per" in others else "uniform",
         "rotation": "so2" if "so2" in others else "none",
     }
-    return {**chosen, "algorithm.demonstration_weight": 0.0} if "sac" in others else chosen
+    return {**chosen, "algorithm.imitation.name": "none"} if "sac" in others else chosen
 
 
 def _training_case(
@@ -300,7 +300,7 @@ def _training_case(
 ) -> Case:
     small = SMALL_CLOSE_LOOP if TASKS[task].control == "close_loop" else SMALL_OPEN_LOOP
     if method.startswith("ferm"):
-        small = {**small, "env.obs_size": 71, "algorithm.crop_size": 64}
+        small = {**small, "env.obs_size": 71, "algorithm.views.size": 64}
     config = {
         "file": file,
         "task": task,

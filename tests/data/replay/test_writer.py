@@ -75,7 +75,7 @@ def test_without_demonstrations_the_oldest_is_overwritten():
 def test_demonstrations_that_exceed_the_capacity_are_refused():
     made = replay(8)
     made.extend(transitions(range(6), True))
-    with pytest.raises(ConfigError, match="raise buffer_size"):
+    with pytest.raises(ConfigError, match="raise the capacity"):
         made.extend(transitions(range(3), True))
     made.extend(transitions([6, 7], True))
     with pytest.raises(ConfigError, match="demonstrations fill the replay of 8 transitions"):

@@ -7,8 +7,8 @@ from ba_torchrl.training.grid.plan import BenchmarkConfig, plan
 REACH, PICK = "close_loop/block_reaching", "close_loop/block_picking"
 PLACE = "open_loop/block_stacking"
 PRESETS = {
-    ("algorithm", "sac"): {"name": "sac", "demonstration_weight": 0.0, "replay": "uniform"},
-    ("algorithm", "sacfd"): {"name": "sac", "demonstration_weight": 1.0},
+    ("algorithm", "sac"): {"name": "sac", "imitation": {"name": "none"}},
+    ("algorithm", "sacfd"): {"name": "sac"},
     ("network", "cnn"): {"name": "cnn"},
     ("network", "small"): {"name": "cnn", "width": 0.25},
 }

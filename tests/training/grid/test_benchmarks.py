@@ -64,7 +64,7 @@ def test_a_shipped_benchmark_is_planned(name, tasks, count):
     [
         ("networks=[fcn,asr]", "sdqfd asr: .*no rz"),
         ("env.obs_size=90", "multiple of 16"),
-        ("algorithm.augmentation=d4", "no yaw to rotate"),
+        ("algorithm.rotation.name=d4", "no yaw to rotate"),
     ],
 )
 def test_networks_for_other_actions_or_images_are_refused(override, message):

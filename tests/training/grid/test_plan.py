@@ -18,7 +18,7 @@ def test_a_grid_is_the_product_of_its_axes_ordered_by_seed(tmp_path):
     first = runs[0]
     assert (first.task, first.label, first.seed) == (REACH, "sac cnn", 0)
     assert (first.benchmark, first.resume, first.total_updates) == ("little", True, 6)
-    assert first.algorithm_config.replay == "uniform"
+    assert first.algorithm_config.replay.name == "uniform"
     assert first.algorithm_config.batch_size == 8
     assert first.run_dir.endswith("grid/close_loop_block_reaching/sac_cnn/seed0")
     assert [run.seed for run in planned(tmp_path, seeds=[7, 3])] == [7, 3]

@@ -1,0 +1,90 @@
+"""Hyper-parameters of algorithms, each of which is built for a network and a problem."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any, ClassVar, Literal
+
+from pydantic import Field, model_validator
+from typing_extensions import Self
+
+from ba_torchrl.algorithms.parts.optimizer import OptimizerConfig
+from ba_torchrl.algorithms.parts.replay import Replay, Uniform
+from ba_torchrl.algorithms.problem import Problem
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.errors import PartError
+from ba_torchrl.core.registry import Registry
+from ba_torchrl.data.transitions import Imitation
+from ba_torchrl.modules.base import NETWORKS, Control, NetworkConfig
+
+ALGORITHMS: Registry[type[LearnerConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
+
+
+class LearnerConfig(StrictModel, ABC):
+    """Hyper-parameters of an algorithm, from which it is built for a network and a problem.
+
+    Learning rate, batch and replay are those of appendix G.2. Each other field says where its
+    default is from.
+    """
+
+    controls: ClassVar[frozenset[Control]]
+    """Controls of the tasks that the algorithm supports."""
+    collects: ClassVar[bool] = True
+    """Whether the policy collects transitions; if not, all updates are on the demonstrations."""
+    is_compilable: ClassVar[bool] = True
+    """Whether `Learner.compile` is possible."""
+
+    optimizer: OptimizerConfig = OptimizerConfig()
+    """Steps along the gradient."""
+    batch_size: int = Field(default=64, ge=1)
+    """Transitions per update."""
+    replay: Replay = Uniform()
+    """Transitions of demonstrations and collection, and how a batch is drawn."""
+    init: Literal["random", "bc"] = "random"
+    """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
+    updates are behaviour cloning of the demonstrations instead of updates of the algorithm. Critics
+    are not trained meanwhile: without a behaviour term, SAC then unlearns the policy."""
+
+    @model_validator(mode="after")
+    def _check_halves(self) -> Self:
+        if self.replay.name == "symmetric" and self.batch_size < 2:
+            raise ValueError("batch_size must be at least 2 with a symmetric replay, half of each")
+        return self
+
+    @property
+    def imitates(self) -> Imitation:
+        """Which action the loss imitates, and on which transitions; by default the executed action
+        of demonstrations, and with ``init="bc"`` the expert's."""
+        return "expert" if self.init == "bc" else "executed"
+
+    @property
+    def init_entropy_weight(self) -> float:
+        """Weight of the policy's negative entropy in the updates of behaviour cloning of
+        ``init="bc"``."""
+        return 0.0
+
+    @property
+    def pretraining_option(self) -> str | None:
+        """The option and its value that only affect updates before the first collection, which
+        the run must then have; None if there is none."""
+        return "init: 'bc'" if self.init == "bc" else None
+
+    def check(self, network: NetworkConfig, control: Control) -> None:
+        """Check that the algorithm supports the task's control, and that the network does.
+
+        Raises:
+            ConfigError: the algorithm or the network does not support this control.
+        """
+        if control not in self.controls:
+            known = [name for name in ALGORITHMS if control in ALGORITHMS[name].controls]
+            why = f"learns {' and '.join(sorted(self.controls))} tasks, not {control} ones"
+            name = ALGORITHMS.name_of(type(self))
+            raise PartError("algorithm", name, why, known, f"{control} tasks")
+        if network.control != control:
+            known = [name for name in NETWORKS if NETWORKS[name].control == control]
+            why, name = f"is for {network.control} tasks", NETWORKS.name_of(type(network))
+            raise PartError("network", name, why, known, f"{control} tasks")
+
+    @abstractmethod
+    def build(self, network: NetworkConfig, problem: Problem) -> Any:
+        """Return a freshly initialised `ba_torchrl.algorithms.base.Learner`."""

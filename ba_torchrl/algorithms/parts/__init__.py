@@ -1,0 +1,1 @@
+"""Parts of algorithms: settings that build what a learner is made of."""
