@@ -16,7 +16,7 @@ def test_a_task_is_in_a_file_of_its_control_with_its_name():
             assert module == "six_dof"
         else:
             file = "houses" if group == "open_loop" and "house" in name else name
-            file = "covid" if name == "covid_test" else file  # else pytest takes it for tests
+            file = "covid" if name == "covid_test" else file
             assert module == f"{group}.{file}"
         assert cls.__name__.lower().endswith(name.replace("_", ""))
         assert pickle.loads(pickle.dumps(cls)) is cls
