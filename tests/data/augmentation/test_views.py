@@ -171,7 +171,7 @@ def test_images_smaller_than_the_centre_are_refused():
 def test_declarations_have_the_size_of_the_crop_and_small_images_are_refused():
     assert cropped_images(close_loop_images(142), 128)[keys.DEPTH].size == 128
     for size in (64, 128):  # all crops of 128 of 128 px would be the same
-        with pytest.raises(ConfigError, match=rf"crop_size=128: image 'depth' has only {size} px"):
+        with pytest.raises(ConfigError, match=rf"views.size=128: image 'depth' has only {size} px"):
             cropped_images(close_loop_images(size), 128)
 
 
