@@ -20,6 +20,7 @@ Backend = Literal["csv", "tensorboard", "wandb"]
 
 SCALARS_FILE = "scalars.csv"
 FILE_INTERVAL_S = 10.0
+_COLUMNS = ("step", "name", "value")
 
 
 class Series(NamedTuple):
@@ -72,7 +73,7 @@ class ScalarLog:
         self._file = self.path.open("a", newline="", encoding="utf-8")
         self._writer = csv.writer(self._file, lineterminator="\n")
         if self._file.tell() == 0:
-            self._writer.writerow(("step", "name", "value"))
+            self._writer.writerow(_COLUMNS)
 
     def write(self, step: int, scalars: Mapping[str, float]) -> None:
         """Write scalars, numbers or tensors of one element, after ``step`` gradient updates."""
@@ -102,7 +103,8 @@ def read_scalars(path: str | Path) -> dict[str, Series]:
         path /= SCALARS_FILE
     text = path.read_text(encoding="utf-8", errors="replace")
     rows = csv.reader(text[: text.rfind("\n") + 1].splitlines())
-    next(rows, None)
+    if tuple(next(rows, ())) != _COLUMNS:
+        raise ValueError(f"{path} does not start with the columns {', '.join(_COLUMNS)}")
     found: dict[str, dict[int, float]] = {}
     for number, row in enumerate(rows, start=2):
         try:

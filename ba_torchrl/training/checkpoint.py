@@ -363,7 +363,7 @@ class Checkpoints:
         return Path(self._rotation.save(self._checkpoint, step=updates, metadata=metadata))
 
     def has(self, updates: int) -> bool:
-        """Whether there is a checkpoint of the policy after so many updates."""
+        """Whether there is a checkpoint of the policy of an update."""
         return any(step_of(path) == updates for path in self._rotation.checkpoints())
 
     def find(self, which: Which) -> Path:
@@ -508,7 +508,7 @@ class ResumeState:
         self._rotation = CheckpointRotation(self._folder, keep_last=2)
 
     def save(self, updates: int) -> None:
-        """Write the state of a run after so many updates."""
+        """Write the state of a run after its latest update, whose number is given."""
         self._rotation.save(self._checkpoint, step=updates)
 
     def load(self) -> bool:

@@ -16,6 +16,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import CHECKSUMS_FILE, fingerprint, seal
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
+from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_failure, read_result
 from ba_torchrl.training.checkpoint import (
     find_checkpoint,
@@ -194,6 +195,7 @@ def test_no_file_of_demonstrations_runs_code(demonstrations, tmp_path):
     [
         ("config.json", read_config),
         ("result.json", read_result),
+        ("scalars.csv", read_scalars),
     ],
 )
 def test_no_record_of_a_run_runs_code(tmp_path, name, opened):
