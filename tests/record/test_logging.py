@@ -109,7 +109,7 @@ class TestReadScalars:
         with pytest.raises(FileNotFoundError):
             read_scalars(path)
         path.write_text("a,b\n1,2\n")
-        with pytest.raises(ValueError, match="line 2 is no step, name and value"):
+        with pytest.raises(ValueError, match="does not start with the columns step, name, value"):
             read_scalars(path)
         path.write_text("step,name,value\n1,loss,high\n")
         with pytest.raises(ValueError, match="line 2"):

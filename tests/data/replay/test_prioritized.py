@@ -91,6 +91,7 @@ def test_native_trees_are_kept(monkeypatch):
 OF_TORCHRL = """
 import warnings
 warnings.simplefilter("error", UserWarning)
+import numpy as np
 import torch
 import ba_torchrl
 from torchrl.data.replay_buffers.samplers import prioritized
@@ -105,6 +106,7 @@ use_python_segment_trees()
 from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, TensorDictPrioritizedReplayBuffer
 
+np.random.seed(0)
 torch.manual_seed(0)
 
 
