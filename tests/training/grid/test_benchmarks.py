@@ -36,12 +36,13 @@ def shipped(name, *overrides):
 SLOW = pytest.mark.slow
 GRIDS = [
     ("close_loop_small", 1, 13),
-    ("cpu_six_dof", 9, 12),
+    ("cpu_six_dof", 9, 9),
     ("equivariance", 3, 9),
+    ("imitation", 2, 12),
     pytest.param("close_loop_3d", 10, 170, marks=SLOW),
     pytest.param("close_loop_4d", 10, 170, marks=SLOW),
     pytest.param("cpu_close_loop", 10, 35, marks=SLOW),
-    pytest.param("cpu_open_loop", 12, 21, marks=SLOW),
+    pytest.param("cpu_open_loop", 12, 12, marks=SLOW),
     pytest.param("open_loop_2d", 12, 96, marks=SLOW),
     pytest.param("open_loop_3d", 12, 96, marks=SLOW),
     pytest.param("open_loop_6d", 9, 45, marks=SLOW),
