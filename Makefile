@@ -37,12 +37,15 @@ train: $(STAMP)
 	$(BIN)/ba-torchrl train --config-name quickstart $(ARGS)
 
 # One process per core, each with one thread: numeric libraries would fight over the cores. The tests
-# of a file run in one process, which builds their environments and kernels once.
+# of a file run in one process, which builds their environments and kernels once. A test that ends
+# its process is repeated in a new one, by default four times per core.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --max-worker-restart 1
+
 test: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile $(ARGS)
+	$(PYTEST) $(ARGS)
 
 test-slow: $(STAMP)
-	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile -m slow $(ARGS)
+	$(PYTEST) -m slow --timeout 3600 -o faulthandler_timeout=3660 $(ARGS)
 
 test-versions: $(STAMP)
 	$(BIN)/python tests/versions.py $(ARGS)

@@ -1,5 +1,6 @@
 import contextlib
 import functools
+import multiprocessing
 
 import pytest
 import torch
@@ -17,6 +18,14 @@ def pytest_collection_modifyitems(items):
     for item in items:
         if item.get_closest_marker("cuda"):
             item.add_marker(pytest.mark.skip(reason="needs a CUDA device"))
+
+
+@pytest.fixture(autouse=True, scope="session")
+def no_process_outlives_the_tests():
+    """Processes that failed tests have left do not keep that of the tests from ending."""
+    yield
+    for process in multiprocessing.active_children():
+        process.kill()
 
 
 @pytest.fixture

@@ -4,10 +4,12 @@ Each is forked from one server: it starts in milliseconds, `python script.py` in
 """
 
 import atexit
+import contextlib
 import multiprocessing
 import os
 import runpy
 import sys
+from collections.abc import Iterator
 from multiprocessing.process import BaseProcess
 from pathlib import Path
 from subprocess import CompletedProcess
@@ -30,22 +32,26 @@ def run_script(
         paths: further folders of modules.
         check: whether another exit code than 0 fails the test.
     """
-    process = start_script(folder, code, paths)
-    process.join(TIMEOUT_S)
-    if process.exitcode is None:
-        process.kill()
+    with script(folder, code, paths) as process:
+        process.join(TIMEOUT_S)
     out, error = ((folder / name).read_text() for name in ("stdout", "stderr"))
     assert process.exitcode == 0 or not check, error[-3000:]
     return CompletedProcess(["script.py"], process.exitcode, out, error)
 
 
-def start_script(folder: Path, code: str, paths: tuple[Path, ...] = ()) -> BaseProcess:
-    """Start code in a folder as `run_script` does; return its process."""
-    script = folder / "script.py"
-    script.write_text(code)
-    process = CONTEXT.Process(target=_main, args=(script, (folder, *paths)))
+@contextlib.contextmanager
+def script(folder: Path, code: str, paths: tuple[Path, ...] = ()) -> Iterator[BaseProcess]:
+    """Start code in a folder as `run_script` does; yield its process, and kill it at the end."""
+    path = folder / "script.py"
+    path.write_text(code)
+    process = CONTEXT.Process(target=_main, args=(path, (folder, *paths)))
     process.start()
-    return process
+    try:
+        yield process
+    finally:
+        if process.exitcode is None:
+            process.kill()
+        process.join(TIMEOUT_S)
 
 
 def _main(script: Path, paths: tuple[Path, ...]) -> None:

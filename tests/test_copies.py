@@ -265,9 +265,13 @@ def test_a_spawned_process_receives_them(names, returned):
     receiver, sender = get_context("spawn").Pipe(duplex=False)
     process = get_context("spawn").Process(target=use_all, args=(things, sender))
     process.start()
-    sender.close()
-    found = pickle.loads(receiver.recv_bytes())
-    process.join()
+    try:
+        sender.close()
+        assert receiver.poll(240)
+        found = pickle.loads(receiver.recv_bytes())
+    finally:
+        process.kill()
+        process.join()
     for name, thing in things.items():
         assert_same(found[name], RETURNED[name][1](thing))
 

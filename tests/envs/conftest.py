@@ -23,7 +23,7 @@ def make_fakes():
     made = []
 
     def make(num_envs=2, *, seed=0, folder=None, horizon=1000, **options):
-        workers = WorkerOptions(**{"start_method": "fork", "timeout_s": 20.0} | options)
+        workers = WorkerOptions(**{"start_method": "fork", "timeout_s": 120.0} | options)
         factory = partial(FakeEnv, folder=folder, horizon=horizon)
         env = make_vector(factory, num_envs, seed=seed, workers=workers)
         made.append(env)

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from tests.fresh import start_script
+from tests.fresh import script
 from tests.training.test_interruption import SAC, assert_same, config_for, outcome
 
 KILLS = 10
@@ -26,10 +26,10 @@ main()
 
 
 def start(folder, **changes):
-    """Start the process of a run, which leads a group of its own; its files are beside the run."""
+    """The process of a run, which leads a group of its own; its files are beside the run."""
     values = {**SETTINGS, **changes, "run_dir": str(folder), "resume": True}
     (folder.parent / "config.json").write_text(json.dumps(values))
-    return start_script(folder.parent, CODE)
+    return script(folder.parent, CODE)
 
 
 def messages(folder):
@@ -42,7 +42,7 @@ def newest_state(folder):
 
 
 def wait_for(condition, process):
-    deadline = time.monotonic() + 60
+    deadline = time.monotonic() + 240
     while not condition():
         assert process.exitcode is None
         assert time.monotonic() < deadline
@@ -53,8 +53,8 @@ def finish(folder, **changes):
     """Run to the end; return all that was learnt and recorded."""
     from ba_torchrl.training.checkpoint import load
 
-    process = start(folder, **changes)
-    process.join(300)
+    with start(folder, **changes) as process:
+        process.join(300)
     assert process.exitcode == 0, messages(folder)[-2000:]
     _, algorithm = load(folder, "latest")
     config = config_for(folder, {**SETTINGS, **changes})
@@ -64,10 +64,10 @@ def finish(folder, **changes):
 def test_a_signal_to_the_whole_group_saves_the_run(tmp_path):
     """Schedulers and terminals signal the workers, too."""
     folder = tmp_path / "run"
-    process = start(folder)
-    wait_for(lambda: newest_state(folder), process)
-    os.killpg(process.pid, signal.SIGTERM)
-    process.join(60)
+    with start(folder) as process:
+        wait_for(lambda: newest_state(folder), process)
+        os.killpg(process.pid, signal.SIGTERM)
+        process.join(240)
     assert process.exitcode == 128 + signal.SIGTERM
     lines = messages(folder).splitlines()
     assert "stopped by SIGTERM, state saved" in lines[-1]
@@ -82,15 +82,13 @@ def test_a_run_killed_at_random_moments_ends_with_the_same_bits(tmp_path):
     reached = set()
     for number in range(KILLS):
         before = newest_state(folder)
-        process = start(folder, **values)
-        if number % 2:
-            wait_for(lambda before=before: newest_state(folder) != before, process)
-            time.sleep(generator.uniform(0, 2))
-        else:
-            time.sleep(generator.uniform(0, 6))
-        assert process.exitcode is None, "the run ended too early to be killed"
-        process.kill()
-        process.join()
+        with start(folder, **values) as process:
+            if number % 2:
+                wait_for(lambda before=before: newest_state(folder) != before, process)
+                time.sleep(generator.uniform(0, 2))
+            else:
+                time.sleep(generator.uniform(0, 6))
+            assert process.exitcode is None, "the run ended too early to be killed"
         reached.add(newest_state(folder))
     assert len(reached) >= KILLS // 2, reached
     assert_same(finish(folder, **values), finish(tmp_path / "whole", **values))

@@ -8,7 +8,7 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from multiprocessing.process import BaseProcess
 from multiprocessing.queues import SimpleQueue
@@ -93,7 +93,7 @@ class MultiCollection(WorkerCollection):
         """Send the weights and return a batch; see `WorkerCollection.collect`."""
         while True:
             try:
-                with _killed_after(self._patience_s, self._collector.procs):
+                with _killed_after(self._patience_s, lambda: self._collector.procs):
                     self._collector.update_policy_weights_(self.weights())
                     batch = next(self._batches)
             # ValueError: TorchRL closes the other processes, which ignore its SIGTERM
@@ -109,9 +109,7 @@ class MultiCollection(WorkerCollection):
         threads = torch.get_num_threads()
         self._collector.shutdown(timeout=_SHUTDOWN_S, raise_on_error=False)
         torch.set_num_threads(threads)  # TorchRL increases the number
-        for process in self._collector.procs:  # those that do not end in time
-            process.kill()
-            process.join()
+        _kill(self._collector.procs)  # those that do not end in time
         self._weight_sync.shutdown()  # at the interpreter's exit, TorchRL would wait forever
 
     def _start(self) -> MultiSyncCollector | MultiAsyncCollector:
@@ -122,21 +120,31 @@ class MultiCollection(WorkerCollection):
         is_main = threading.current_thread() is threading.main_thread()
         self._errors = mp.get_context(workers.start_method).SimpleQueue()
         self._weight_sync = _WeightSync()
-        with _start_method(workers.start_method):
-            return self._collector_class(
-                self.make_envs(problem.make_env, self._restarts),
-                # TorchRL sends its weights at first, and moves them to shared memory.
-                policy=copy.deepcopy(self.policy).to("cpu"),
-                policy_factory=self.make_policies(self._restarts),
-                collector_class=partial(_WorkersCollector, errors=self._errors),
-                frames_per_batch=self._frames,
-                total_frames=-1,
-                storing_device="cpu",
-                weight_sync_schemes={"policy": self._weight_sync},
-                num_threads=torch.get_num_threads(),
-                auto_register_policy_transforms=False,
-                init_fn=partial(_prepare_worker, os.getpid() if is_main else None),
-            )
+        before = {*mp.active_children()}
+
+        def started() -> set[BaseProcess]:
+            return {*mp.active_children()} - before
+
+        try:
+            with _start_method(workers.start_method), _killed_after(self._patience_s, started):
+                return self._collector_class(
+                    self.make_envs(problem.make_env, self._restarts),
+                    # TorchRL sends its weights at first, and moves them to shared memory.
+                    policy=copy.deepcopy(self.policy).to("cpu"),
+                    policy_factory=self.make_policies(self._restarts),
+                    collector_class=partial(_WorkersCollector, errors=self._errors),
+                    frames_per_batch=self._frames,
+                    total_frames=-1,
+                    storing_device="cpu",
+                    weight_sync_schemes={"policy": self._weight_sync},
+                    num_threads=torch.get_num_threads(),
+                    auto_register_policy_transforms=False,
+                    init_fn=partial(_prepare_worker, os.getpid() if is_main else None),
+                )
+        except BaseException:
+            _kill(started())
+            self._weight_sync.shutdown()
+            raise
 
     def _replace(self, cause: Exception) -> None:
         """Replace the workers after a failure.
@@ -224,15 +232,22 @@ def _prepare_worker(parent: int | None) -> None:
         signal.signal(number, signal.SIG_IGN)
 
 
+def _kill(processes: Iterable[BaseProcess], *, and_wait: bool = True) -> None:
+    for process in processes:
+        with contextlib.suppress(ValueError):  # TorchRL has closed it
+            process.kill()
+            if and_wait:
+                process.join()
+
+
 @contextlib.contextmanager
-def _killed_after(seconds: float, processes: Sequence[BaseProcess]) -> Iterator[None]:
-    """Context that kills processes when it takes too long; TorchRL waits for those that hang, and
-    notices an end within a second."""
+def _killed_after(seconds: float, find: Callable[[], Iterable[BaseProcess]]) -> Iterator[None]:
+    """Context that kills the processes found when it takes too long; TorchRL waits for those that
+    hang, and notices an end within a second."""
 
     def kill() -> None:
         logger.warning("workers did not answer for %g s and are killed", seconds)
-        for process in processes:
-            process.kill()
+        _kill(find(), and_wait=False)
 
     timer = threading.Timer(seconds, kill)
     timer.daemon = True

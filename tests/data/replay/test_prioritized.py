@@ -351,9 +351,9 @@ def test_a_large_checkpoint_is_saved_and_loaded_fast():
     sampler = ExpertPrioritizedSampler(100_000, expert_bonus=0)
     sampler.update_priority(torch.arange(100_000), torch.rand(100_000))
     other = ExpertPrioritizedSampler(100_000, expert_bonus=0)
-    start = time.perf_counter()
+    start = time.process_time()
     other.load_state_dict(sampler.state_dict())
-    assert time.perf_counter() - start < 2
+    assert time.process_time() - start < 2
     assert other._sum_tree.query(0, 100_000) == pytest.approx(sampler._sum_tree.query(0, 100_000))
 
 

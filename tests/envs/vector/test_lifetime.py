@@ -14,7 +14,7 @@ import ba_torchrl
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector import parallel
-from tests.fresh import start_script
+from tests.fresh import script
 
 PARENT = """
 import os, signal, sys, time
@@ -50,7 +50,7 @@ step = env.step(act(env, env.reset()))
 assert not step["next", "fault"].any() and env.restarts == 0
 print("stepped after the end of the thread", flush=True)
 os.kill(env.worker_pids[0], signal.SIGSTOP)
-time.sleep(100)
+time.sleep(1000)
 """
 FAKES = Path(fake_env.__file__).parent
 
@@ -62,7 +62,7 @@ def is_running(pid):
         return False
 
 
-def wait_until_gone(pids, seconds=10.0):
+def wait_until_gone(pids, seconds=60.0):
     deadline = time.monotonic() + seconds
     while time.monotonic() < deadline:
         if not any(map(is_running, pids)):
@@ -80,35 +80,33 @@ def wait_until_gone(pids, seconds=10.0):
     ],
 )
 def test_no_worker_survives_its_parent(tmp_path, how, method):
-    end = "time.sleep(100)" if how == "killed" else "sys.exit(0)"
-    script = PARENT.format(tests=str(FAKES), method=method, end=end)
-    parent, pids = start_parent(tmp_path, script)
-    if how == "killed":
-        parent.kill()
-    parent.join(10)
+    end = "time.sleep(1000)" if how == "killed" else "sys.exit(0)"
+    with script(tmp_path, PARENT.format(tests=str(FAKES), method=method, end=end)) as parent:
+        pids = printed_ids(tmp_path)
+        if how == "killed":
+            parent.kill()
+        parent.join(60)
     assert parent.exitcode == (-signal.SIGKILL if how == "killed" else 0)
     assert wait_until_gone(pids)
 
 
 def test_workers_of_a_thread_survive_the_thread_but_not_the_process(tmp_path):
-    parent, pids = start_parent(tmp_path, THREAD.format(tests=str(FAKES)))
-    assert printed(tmp_path, 2)[1] == "stepped after the end of the thread"
-    parent.kill()
-    parent.join(10)
+    with script(tmp_path, THREAD.format(tests=str(FAKES))):
+        pids = printed_ids(tmp_path)
+        assert printed(tmp_path, 2)[1] == "stepped after the end of the thread"
     assert wait_until_gone(pids)
 
 
-def start_parent(folder, source):
-    """Start a script that prints the ids of its three workers; return its process and the ids."""
-    parent = start_script(folder, source)
+def printed_ids(folder):
+    """Wait for the ids of the three workers of a script, and return them."""
     pids = [int(pid) for pid in printed(folder, 1)[0].split()]
     assert len(pids) == 3
-    return parent, pids
+    return pids
 
 
 def printed(folder, count):
     """Wait for lines of a script's output, and return them."""
-    out, deadline = folder / "stdout", time.monotonic() + 60
+    out, deadline = folder / "stdout", time.monotonic() + 240
     while not out.exists() or out.read_text().count("\n") < count:
         assert time.monotonic() < deadline, (folder / "stderr").read_text()
         time.sleep(0.02)

@@ -2,7 +2,6 @@ import gc
 import multiprocessing
 import os
 import signal
-import time
 from functools import partial
 from typing import ClassVar
 
@@ -248,9 +247,8 @@ class TestResources:
         env = make_fakes(2)
         env.shutdown_timeout = 0.5
         os.kill(env.worker_pids[1], signal.SIGSTOP)
-        start = time.perf_counter()
         env.close()
-        assert time.perf_counter() - start < 3
+        assert multiprocessing.active_children() == []
 
     def test_threads_of_this_process(self, make_fakes):
         before = torch.get_num_threads()

@@ -90,6 +90,7 @@ def _write_shared_entries(seed):
 
 def test_concurrent_writes_leave_valid_entries(own_cache):
     with multiprocessing.get_context("fork").Pool(6) as pool:
-        assert set(pool.map(_write_shared_entries, range(60), chunksize=1)) == {0.0}
+        found = pool.map_async(_write_shared_entries, range(60), chunksize=1).get(timeout=240)
+    assert set(found) == {0.0}
     assert len(list(own_cache.rglob("*.npz"))) == 3
     assert not list(own_cache.rglob("*.tmp"))

@@ -168,7 +168,7 @@ def test_size_and_position_of_a_mesh_do_not_change_its_shape(tmp_path, scale, of
     mesh = Mesh(plain.vertices * scale + offset_m, plain.faces)
     # in a process of its own: an offset of 5e6 m ends one that decomposes as it is
     with multiprocessing.get_context("fork").Pool(1) as pool:  # daemonic, as workers are
-        shape = pool.apply_async(load, (tmp_path, mesh)).get(timeout=120)
+        shape = pool.apply_async(load, (tmp_path, mesh)).get(timeout=240)
     extents = np.ptp(shape.mesh().vertices, axis=0)
     np.testing.assert_allclose(extents / extents[0], (1.0, 1.0, 2 / 3), rtol=0.02)
     fill = volume(shape) / extents.prod()
@@ -226,7 +226,7 @@ def test_a_concave_mesh_needs_no_standard_output(tmp_path):
         f"assert len(load_object_set('graspnet', {str(tmp_path)!r})[0].parts) > 1\n"
     )
     command = ["sh", "-c", 'exec "$0" -c "$1" <&- >&-', sys.executable, program]
-    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=120)
+    done = subprocess.run(command, stderr=subprocess.PIPE, text=True, timeout=240)
     assert done.returncode == 0, done.stderr
 
 
