@@ -241,7 +241,7 @@ def check_update(values: dict[str, object]) -> None:
     finally:
         env.close()
     algorithm.on_demonstrations(episodes)
-    algorithm.pretrain_update()
+    algorithm.update()
     if config.algorithm_config.collects:
         algorithm.update()
 

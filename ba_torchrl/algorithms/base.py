@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModuleBase
+from tensordict.nn import TensorDictModuleBase
 from torch import Tensor, nn
 from torch.optim import Optimizer
 from torch.optim.lr_scheduler import LRScheduler
@@ -29,15 +29,14 @@ from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.optimizers import LossFunction, Optimizers, Update
 from ba_torchrl.algorithms.problem import Problem, SeedUse, derive_seed
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError, PartError
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
-from ba_torchrl.data.transfer import batch_to_device, to_device
-from ba_torchrl.data.transitions import WITH_TARGET, as_transitions
+from ba_torchrl.data.transfer import batch_to_device
+from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
 from ba_torchrl.modules.layers import compute_dtype
-from ba_torchrl.objectives.imitation import BehaviourCloningLoss
 
 __all__ = [
     "ALGORITHMS",
@@ -120,7 +119,7 @@ class Learner(ABC):
             acting, self.make_acting_transforms(), self.make_exploration()
         ).to(problem.device)
         self.stages = self.make_stages()
-        self.init_loss = self.make_init_loss() if config.init == "bc" else None
+        self.pretraining = self.make_pretraining()
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
         if problem.device.type != "cpu":
@@ -159,21 +158,6 @@ class Learner(ABC):
     def make_loss(self, networks: Any) -> LossModule:
         """Return the loss module with its value estimator."""
 
-    def make_init_loss(self) -> LossModule:
-        """Return the loss of the pretraining updates with ``init="bc"``.
-
-        Raises:
-            ConfigError: the policy is not a distribution of actions.
-        """
-        policy = self.trained_policy
-        if not isinstance(policy, ProbabilisticTensorDictSequential):
-            name = ALGORITHMS.name_of(type(self.config))
-            why = "has no actor for cloning to initialise; leave out init"
-            raise PartError("algorithm", name, why)
-        loss = BehaviourCloningLoss(policy, "kl", self.config.init_entropy_weight)
-        loss.set_keys(action=keys.TARGET_ACTION)
-        return loss
-
     def make_acting_transforms(self) -> list[Transform]:
         """Return the transforms of the observation that the acting policy sees; by default the
         images' codecs."""
@@ -188,6 +172,11 @@ class Learner(ABC):
         """Return the losses of an update in the order in which they are minimised, each after the
         optimisers' step on the one before; by default the loss module alone."""
         return [self.loss]
+
+    def make_pretraining(self) -> list[tuple[int, LossFunction]]:
+        """Return numbers of first updates of a run and the loss of each, which these updates
+        minimise instead of the stages; by default none."""
+        return []
 
     def due_stages(self) -> Sequence[LossFunction]:
         """Return the stages of the update that follows `updates` others; by default all. An
@@ -277,6 +266,10 @@ class Learner(ABC):
         for episode in episodes:
             self.extend(self.to_transitions(episode, is_demonstration=True))
 
+    def on_collected(self, data: TensorDictBase) -> None:
+        """Process collected steps, of any batch shape; by default they enter the replay."""
+        self.extend(self.to_transitions(data, is_demonstration=False))
+
     def extend(self, transitions: TensorDictBase) -> None:
         """Add transitions [N], and augmented copies if configured, to the replay, except those with
         a fault."""
@@ -290,19 +283,15 @@ class Learner(ABC):
         """Number of transitions in the replay."""
         return len(self.replay)
 
-    def sample(self, *, demonstrations_only: bool = False) -> TensorDictBase:
-        """Return an augmented batch from the replay on the learner's device, on request only its
-        demonstrations."""
+    def sample(self) -> TensorDictBase:
+        """Return an augmented batch from the replay on the learner's device."""
         sampler = self._prioritized_sampler()
         if sampler is not None:
-            sampler.anneal(self._annealing_progress())
+            first = self.config.pretraining_updates
+            own, total = (n - first for n in (self.updates, self.problem.total_updates))
+            sampler.anneal(max(own, 0) / max(total, 1))
         batch, device = self.replay.sample(), self.problem.device
-        is_demonstration = batch[keys.IS_DEMONSTRATION] if demonstrations_only else None
-        if device.type != "cpu":
-            batch = batch_to_device(batch, device)
-        if is_demonstration is None:
-            return batch
-        return batch[to_device(is_demonstration.reshape(-1).nonzero()[:, 0], device)]
+        return batch if device.type == "cpu" else batch_to_device(batch, device)
 
     # -- updates -----------------------------------------------------------------------------
 
@@ -321,34 +310,21 @@ class Learner(ABC):
         return scalars
 
     def compile(self, mode: CompileMode) -> None:
-        """Compile the loss and its gradient, except those of ``pretraining_option``.
+        """Compile the loss and its gradient, except those of `make_pretraining`.
 
         Raises:
-            ConfigError: the algorithm cannot be compiled, the mode is unknown, or the system has no
-                compiler.
+            ConfigError: the system has no compiler.
         """
-        if not self.config.is_compilable:
-            raise ConfigError("compile_mode: this algorithm cannot be compiled; leave it out")
         self.stages = [CompiledLoss(self.loss, mode, stage) for stage in self.stages]
-
-    def own_updates(self, updates: int) -> int:
-        """Return how many of the first updates of a run minimise the algorithm's own loss."""
-        is_own = self.config.pretraining_option is None
-        return updates if is_own else max(updates - self.problem.pretrain_updates, 0)
-
-    def _annealing_progress(self) -> float:
-        total = self.own_updates(self.problem.total_updates)
-        return self.own_updates(self.updates) / max(total, 1)
 
     def _set_priorities(self, errors: dict[str, Tensor]) -> None:
         self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))
 
     def pretrain_update(self) -> TensorDict:
-        """Take one update before the first collection; with ``init="bc"``, of behaviour cloning of
-        the expert's transitions in a batch. It counts, returns and raises as `update`."""
-        if self.init_loss is None:
-            return self.update()
-        return self.minimize(self.sample(demonstrations_only=True), [self.init_loss])
+        """Take one of the first updates, of the losses of `make_pretraining` that are due. It
+        counts, returns and raises as `update`."""
+        due = [loss for updates, loss in self.pretraining if self.updates < updates]
+        return self.minimize(self.sample(), due)
 
     def minimize(self, batch: TensorDictBase, stages: Sequence[LossFunction]) -> TensorDict:
         """Take the steps of `step`, with its arguments and result, and count the update."""
@@ -439,18 +415,5 @@ class Learner(ABC):
         return self.replay.state_dict()
 
     def load_replay_state(self, state: dict[str, Any]) -> None:
-        """Restore the replay from a `replay_state`.
-
-        Raises:
-            ConfigError: its transitions have other entries than those of this learner.
-        """
+        """Restore the replay from a `replay_state`."""
         self.replay.load_state_dict(state)
-        has_target = self.config.imitates in WITH_TARGET
-        expected = {keys.IS_DEMONSTRATION: True, keys.TARGET_ACTION: has_target}
-        for key, is_expected in expected.items():
-            if len(self.replay) and (key in self.replay.stored_keys) != is_expected:
-                raise ConfigError(
-                    f"the saved transitions {'lack' if is_expected else 'have'} the entry {key!r}: "
-                    "another version of the library wrote them; start the run again in another "
-                    "run_dir"
-                )

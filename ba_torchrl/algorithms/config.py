@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
@@ -40,10 +40,6 @@ class LearnerConfig(StrictModel, ABC):
     """Transitions per update."""
     replay: Replay = Uniform()
     """Transitions of demonstrations and collection, and how a batch is drawn."""
-    init: Literal["random", "bc"] = "random"
-    """Initialisation of the policy: "random" weights, or "bc", for which the run's pretraining
-    updates are behaviour cloning of the demonstrations instead of updates of the algorithm. Critics
-    are not trained meanwhile: without a behaviour term, SAC then unlearns the policy."""
 
     @model_validator(mode="after")
     def _check_halves(self) -> Self:
@@ -53,21 +49,15 @@ class LearnerConfig(StrictModel, ABC):
 
     @property
     def imitates(self) -> Imitation:
-        """Which action the loss imitates, and on which transitions; by default the executed action
-        of demonstrations, and with ``init="bc"`` the expert's."""
-        return "expert" if self.init == "bc" else "executed"
+        """Which action the losses imitate, and on which transitions; by default the executed action
+        of demonstrations."""
+        return "executed"
 
     @property
-    def init_entropy_weight(self) -> float:
-        """Weight of the policy's negative entropy in the updates of behaviour cloning of
-        ``init="bc"``."""
-        return 0.0
-
-    @property
-    def pretraining_option(self) -> str | None:
-        """The option and its value that only affect updates before the first collection, which
-        the run must then have; None if there is none."""
-        return "init: 'bc'" if self.init == "bc" else None
+    def pretraining_updates(self) -> int:
+        """Number of first updates of a run that minimise the losses of `Learner.make_pretraining`,
+        all on the demonstrations; by default none."""
+        return 0
 
     def check(self, network: NetworkConfig, control: Control) -> None:
         """Check that the algorithm supports the task's control, and that the network does.

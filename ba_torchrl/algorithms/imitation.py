@@ -8,7 +8,7 @@ the expert's action in every state that DAgger visits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Literal
+from typing import Any, ClassVar
 
 import torch
 from pydantic import Field
@@ -49,7 +49,6 @@ class ImitationConfig(LearnerConfig):
     rotation: RigidRotation = NoRotation()
     """Rigid transforms of sampled open-loop transitions."""
     replay: Uniform = Uniform()
-    init: Literal["random"] = "random"
 
     def check(self, network: NetworkConfig, control: Control) -> None:
         """As for `LearnerConfig`; rigid transforms in close loop are refused too."""

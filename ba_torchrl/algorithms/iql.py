@@ -17,7 +17,15 @@ from torch import nn
 from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import IQLLoss, SoftUpdate
 
-from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem
+from ba_torchrl.algorithms.base import (
+    ALGORITHMS,
+    Control,
+    Learner,
+    LearnerConfig,
+    LossFunction,
+    Problem,
+)
+from ba_torchrl.algorithms.parts.init import Init, RandomInit
 from ba_torchrl.algorithms.parts.replay import Symmetric, Uniform
 from ba_torchrl.core import keys
 from ba_torchrl.data.transitions import Imitation
@@ -39,6 +47,8 @@ class IQLConfig(LearnerConfig):
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
 
     replay: Annotated[Uniform | Symmetric, Field(discriminator="name")] = Uniform()
+    init: Init = RandomInit()
+    """Initialisation of the policy."""
     expectile: float = Field(default=0.9, gt=0, lt=1)
     """Expectile of the actions' values that is the value of a state."""
     temperature: float = Field(default=10.0, ge=0)
@@ -53,8 +63,13 @@ class IQLConfig(LearnerConfig):
 
     @property
     def imitates(self) -> Imitation:
-        """No action, except with ``init="bc"``: all transitions have the same loss."""
-        return "expert" if self.init == "bc" else "none"
+        """No action, except in behaviour cloning: all transitions have the same loss."""
+        return "none" if self.init.name == "random" else "expert"
+
+    @property
+    def pretraining_updates(self) -> int:
+        """Those of the initialisation."""
+        return self.init.updates
 
     def build(self, network: NetworkConfig, problem: Problem) -> IQL:
         """Return a freshly initialised learner."""
@@ -108,6 +123,10 @@ class IQL(Learner):
         )
         loss.make_value_estimator(gamma=self.config.gamma)
         return loss
+
+    def make_pretraining(self) -> list[tuple[int, LossFunction]]:
+        """Return the loss of the initialisation."""
+        return self.config.init.build(self.trained_policy)
 
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the critics' targets."""

@@ -61,8 +61,6 @@ class Problem:
     """Length of each vector that the environment observes, by key."""
     center_m: tuple[float, float] = (0.0, 0.0)
     """x and y of the workspace's centre."""
-    pretrain_updates: int = 0
-    """The first of `total_updates`, before the first collection."""
 
     def derived_seed(self, use: SeedUse) -> int:
         """Return the run's seed for one use of randomness."""

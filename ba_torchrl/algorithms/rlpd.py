@@ -54,7 +54,7 @@ class RLPDConfig(SACConfig):
     @property
     def imitates(self) -> Imitation:
         """No action without such a term: all transitions have the same loss."""
-        return "none" if self.init == "random" and self.imitation.name == "none" else "expert"
+        return "none" if self.init.name == "random" and self.imitation.name == "none" else "expert"
 
     def build(self, network: NetworkConfig, problem: Problem) -> RLPD:
         """Return a freshly initialised learner.
@@ -97,9 +97,9 @@ class RLPD(SAC):
 
     def make_scheduler(self, optimizer: Optimizer) -> LinearLR:
         """Return the schedule of the learning rate, which steps once per critic update."""
-        updates = self.problem.total_updates
-        further = self.own_updates(updates) * (self.config.critic_updates - 1)
-        return self.config.optimizer.schedule(optimizer, updates + further)
+        total, config = self.problem.total_updates, self.config
+        further = (total - config.pretraining_updates) * (config.critic_updates - 1)
+        return config.optimizer.schedule(optimizer, total + further)
 
     def update(self) -> TensorDict:
         """Take the critic updates, the last one together with that of policy and temperature."""

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import torch
 from pydantic import Field, model_validator
-from tensordict import TensorDict, TensorDictBase
+from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.optim import Optimizer
@@ -29,6 +29,7 @@ from ba_torchrl.algorithms.base import (
 )
 from ba_torchrl.algorithms.parts.contrastive import Contrastive, NoContrastive
 from ba_torchrl.algorithms.parts.imitation import Behaviour, Demonstrations
+from ba_torchrl.algorithms.parts.init import ExploringInit, RandomInit
 from ba_torchrl.algorithms.parts.rotation import NoRotation, Rotation
 from ba_torchrl.algorithms.parts.views import NoViews, Views
 from ba_torchrl.core import keys
@@ -66,6 +67,8 @@ class SACConfig(LearnerConfig):
     bootstrap_truncated: bool = True
     """Whether targets bootstrap on steps that the time limit truncates; the reference
     implementation does not."""
+    init: ExploringInit = RandomInit()
+    """Initialisation of the policy."""
     imitation: Behaviour = Demonstrations()
     """The behaviour term, which pulls the policy to demonstrated actions."""
     exploration_noise: float = Field(default=0.0, ge=0)
@@ -90,16 +93,9 @@ class SACConfig(LearnerConfig):
         return "expert"
 
     @property
-    def init_entropy_weight(self) -> float:
-        """The initial entropy temperature, so that the cloned policy explores."""
-        return self.alpha_init
-
-    @property
-    def pretraining_option(self) -> str | None:
-        """As for `LearnerConfig`."""
-        if self.contrastive.pretraining == "contrastive":
-            return "contrastive.pretraining: 'contrastive'"
-        return super().pretraining_option
+    def pretraining_updates(self) -> int:
+        """Those of the initialisation or, if there are more, of the contrastive loss."""
+        return max(self.init.updates, self.contrastive.updates)
 
     def build(self, network: NetworkConfig, problem: Problem) -> SAC:
         """Return a freshly initialised learner."""
@@ -194,6 +190,12 @@ class SAC(Learner):
         contrastive = [] if self.loss.contrastive is None else [self.loss.contrastive_loss]
         return [self.loss, *contrastive]
 
+    def make_pretraining(self) -> list[tuple[int, LossFunction]]:
+        """Return the loss of the initialisation, and the contrastive one."""
+        config = self.config
+        contrastive = (config.contrastive.updates, self.loss.contrastive_loss)
+        return [*config.init.build(self.trained_policy), contrastive]
+
     def make_target_updater(self) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""
         config = self.config
@@ -241,17 +243,17 @@ class SAC(Learner):
             "loss_contrastive": {name: self.adam(each, weight) for name, each in chosen.items()}
         }
 
-    def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
-        """Return collected data as the transitions [N] that the replay stores; if successes are
-        imitated, those of the episodes that have ended."""
-        if is_demonstration or self.episodes is None:
-            return super().to_transitions(data, is_demonstration=is_demonstration)
+    def on_collected(self, data: TensorDictBase) -> None:
+        """Store collected steps; if successes are imitated, the episodes that have ended, of which
+        those that succeed count as demonstrations."""
+        if self.episodes is None:
+            return super().on_collected(data)
         data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
         new = self.entries_per_transition * int(data[keys.IS_EXPERT].sum())
         stored = self.replay.num_demonstrations + new
         if stored > self.config.replay.capacity // 2:  # demonstrations are never overwritten
             data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
-        return super().to_transitions(data, is_demonstration=True)
+        return self.on_demonstrations([data])
 
     def replay_state(self) -> dict[str, Any]:
         """Return the state of the replay and, if successes are imitated, the transitions of
@@ -269,13 +271,3 @@ class SAC(Learner):
     def network_parameters(self) -> list[nn.Parameter]:
         """Return all parameters but the entropy temperature."""
         return [p for p in self.loss.parameters() if p is not self.loss.log_alpha]
-
-    def pretrain_update(self) -> TensorDict:
-        """Take one update on the demonstrations, as `InfoNCE.pretraining` says."""
-        if self.config.contrastive.pretraining == "all":
-            return super().pretrain_update()
-        batch = self.sample(demonstrations_only=self.init_loss is not None)
-        stages = [self.loss.contrastive_loss]
-        if self.init_loss is not None:
-            stages.insert(0, self.init_loss)
-        return self.minimize(batch, stages)

@@ -120,8 +120,8 @@ class RunResult(StrictModel):
     and hardware are those of the test, and what its card does not know of its training is None.
     """
 
-    format: Literal[2] = 2
-    """1: rates without the outcomes of episodes."""
+    format: Literal[3] = 3
+    """1: rates without the outcomes of episodes. 2: a configuration of another form."""
     protocol: int
     """Version of the protocol of the tests; see `ba_torchrl.training.protocol`."""
     task: str

@@ -474,7 +474,6 @@ def problem_of(config: ExperimentConfig) -> Problem:
         center_m=config.resolved_env.workspace.center,
         actions=env.actions,
         total_updates=config.total_updates,
-        pretrain_updates=config.pretrain_updates,
         seed=config.seed,
         device=config.torch_device,
     )

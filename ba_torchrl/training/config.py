@@ -103,7 +103,8 @@ class ExperimentConfig(WorkerOptions):
     demonstrations_mapping: str | None = None
     """YAML file with the names of the entries in somebody else's demonstrations (docs/data.md)."""
     pretrain_updates: int = Field(default=0, ge=0)
-    """Updates on the demonstrations before the first environment step."""
+    """Updates on the demonstrations before the first environment step, besides those of parts of
+    the algorithm, such as ``algorithm.init.updates``."""
     total_updates: int = Field(default=10_000, ge=1)
     """Gradient updates of the run, pretraining included; reference implementation."""
     updates_per_step: int = Field(default=1, ge=1)
@@ -226,19 +227,19 @@ class ExperimentConfig(WorkerOptions):
         control = config.resolved_env.task_class.control
         config.algorithm_config.check(config.network_config, control)
         config._check_reward()
-        if config.pretrain_updates > config.total_updates:
+        own = config.algorithm_config.pretraining_updates
+        offline = own + config.pretrain_updates
+        if offline > config.total_updates:
+            others = f"{own} updates of pretraining of the algorithm and " if own else ""
             raise ConfigError(
-                f"pretrain_updates ({config.pretrain_updates}) is part of total_updates "
+                f"{others}pretrain_updates ({config.pretrain_updates}) are part of total_updates "
                 f"({config.total_updates}) and cannot exceed it"
             )
-        if config.pretrain_updates and not config.demonstrations:
-            raise ConfigError("pretrain_updates needs demonstrations")
+        if offline and not config.demonstrations:
+            raise ConfigError("updates before the first environment step need demonstrations")
         if not config.algorithm_config.collects and not config.demonstrations:
             why = "learns from demonstrations only; set demonstrations"
             raise PartError("algorithm", config.algorithm["name"], why)
-        option = config.algorithm_config.pretraining_option
-        if option is not None and not config.pretrain_updates:
-            raise ConfigError(f"algorithm.{option} takes effect in pretrain_updates; set them")
         capacity = config.algorithm_config.replay.capacity
         if config.min_replay > capacity:
             raise ConfigError(
@@ -291,9 +292,6 @@ class ExperimentConfig(WorkerOptions):
         """Yield a message for each value that has no effect together with the others."""
         if not self.demonstrations:
             yield from changed(self, _OF_DEMONSTRATIONS, "with demonstrations=0")
-        option = self.algorithm_config.pretraining_option
-        if option is not None and self.pretrain_updates == self.total_updates:
-            yield from changed(self, ["compile_mode"], f"without updates after those of {option}")
 
     def _check_reward(self) -> None:
         env, gamma = self.resolved_env.config, getattr(self.algorithm_config, "gamma", None)

@@ -179,11 +179,13 @@ class Experiment:
         computed = precision(config)
         if computed not in self.state.precisions:
             self.state.precisions.append(computed)
+        first = config.algorithm_config.pretraining_updates
         collects = config.algorithm_config.collects
-        pretrain_updates = config.pretrain_updates if collects else config.total_updates
+        offline = first + config.pretrain_updates if collects else config.total_updates
         with self._phase("pretraining"):
-            while algorithm.updates < pretrain_updates and not self._is_complete:
-                self._update(algorithm.pretrain_update)
+            while algorithm.updates < offline and not self._is_complete:
+                is_first = algorithm.updates < first
+                self._update(algorithm.pretrain_update if is_first else algorithm.update)
         if self._is_complete:
             return
         with self.state.timed("collection"):
@@ -277,7 +279,7 @@ class Experiment:
         state.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
         if self.algorithm.config.imitates == "expert_everywhere":
             state.expert_labels += int((is_present & ~following[keys.FAULT]).sum())
-        self.algorithm.extend(self.algorithm.to_transitions(data, is_demonstration=False))
+        self.algorithm.on_collected(data)
         return state.env_steps // self.config.num_envs - steps_before
 
     def _update(self, take_update: Callable[[], TensorDict]) -> None:

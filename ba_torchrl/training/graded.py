@@ -254,7 +254,7 @@ def half_trained(
     while updates and learner.updates < MOST_UPDATES:
         before = copy.deepcopy(learner.state_dict())
         for _ in range(updates):
-            learner.pretrain_update()
+            learner.update()
         rate = evaluate(env, policy, _SELECTION_EPISODES, seed).success_rate
         logger.info("%s, medium: success %.2f after %d updates", sets.task, rate, learner.updates)
         if least <= rate <= most:

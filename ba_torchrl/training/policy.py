@@ -87,8 +87,9 @@ _WAY_OUT = "policy.make_env(), or a command without env.*, makes the environment
 class PolicyCard(StrictModel):
     """What is known of a policy in a file."""
 
-    format: Literal[3] = 3
-    """1: kernels whose signs depended on the CPU. 2: no versions, and episodes of other seeds."""
+    format: Literal[4] = 4
+    """1: kernels whose signs depended on the CPU. 2: no versions, and episodes of other seeds. 3: a
+    configuration of another form."""
     task: str
     task_version: int
     """Of the training and of the episodes."""

@@ -195,27 +195,15 @@ def test_a_run_without_it_is_not_compiled(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "mode", "before_the_run", "of_the_learner"),
+    ("name", "mode", "message"),
     [
-        (
-            "rlpd",
-            "default",
-            "algorithm 'rlpd' cannot be.*compile_mode",
-            "this algorithm cannot be compiled",
-        ),
-        (
-            "sac",
-            "fast",
-            "compile_mode.*reduce-overhead",
-            "'fast' is unknown; known: default, reduce-overhead",
-        ),
+        ("rlpd", "default", "algorithm 'rlpd' cannot be.*compile_mode"),
+        ("sac", "fast", "compile_mode.*reduce-overhead"),
     ],
 )
-def test_what_cannot_be_compiled_is_refused(tmp_path, name, mode, before_the_run, of_the_learner):
-    with pytest.raises(ConfigError, match=before_the_run):
+def test_what_cannot_be_compiled_is_refused(tmp_path, name, mode, message):
+    with pytest.raises(ConfigError, match=message):
         make_experiment(tmp_path, "cnn", {"name": name}, compile_mode=mode)
-    with pytest.raises(ConfigError, match=f"compile_mode: {of_the_learner}"):
-        build(name, "cnn").compile(mode)
 
 
 def test_a_missing_compiler_is_found_before_the_run(tmp_path):

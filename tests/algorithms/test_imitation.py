@@ -68,10 +68,9 @@ def test_the_imitated_action_is_transformed_with_the_scene(algorithm):
 
 
 def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
-    algorithm = {"name": "sac", "init": "bc", "replay": {"name": "prioritized"}}
-    made = make_experiment(
-        tmp_path, "cnn", algorithm, total_updates=32, pretrain_updates=30, eval_every=32
-    )
+    init = {"name": "bc", "updates": 30}
+    algorithm = {"name": "sac", "init": init, "replay": {"name": "prioritized"}}
+    made = make_experiment(tmp_path, "cnn", algorithm, total_updates=32, eval_every=32)
     learner = made.algorithm
     critic = learner.loss.qvalue_network_params.clone()
     state, taken = {}, []
@@ -103,7 +102,7 @@ def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
 
 @pytest.mark.parametrize("name", ["sac", "rlpd", "iql"])
 def test_any_actor_is_initialised_and_nothing_else(name):
-    learner = build(name, init="bc", batch_size=6)
+    learner = build(name, init={"name": "bc", "updates": 1}, batch_size=6)
     learner.extend(transitions(learner))
     before = {key: p.detach().clone() for key, p in learner.loss.named_parameters()}
     scalars = learner.pretrain_update()
@@ -122,7 +121,7 @@ def test_any_actor_is_initialised_and_nothing_else(name):
     [
         ("cnn", {"name": "bc"}, {}),
         ("asr", {"name": "bc"}, OPEN),
-        ("cnn", {"name": "sac", "init": "bc"}, {"pretrain_updates": 1}),
+        ("cnn", {"name": "sac", "init": {"name": "bc", "updates": 1}}, {}),
     ],
     ids=["close_loop", "open_loop", "initialisation"],
 )
@@ -132,7 +131,8 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     settings = {"total_updates": 2, "eval_every": 2, **changes, "demonstrations_noise": 0.5}
     made = make_experiment(tmp_path, network, algorithm, **settings)
     learner, imitated, episodes = made.algorithm, [], []
-    loss = learner.init_loss or learner.loss
+    first = [loss for updates, loss in learner.pretraining if updates]
+    (loss,) = first or [learner.loss]
     key = loss.tensor_keys.action
     assert key == keys.TARGET_ACTION
     loss.register_forward_pre_hook(lambda _, args: imitated.append(args[0][key].clone()))
@@ -144,7 +144,7 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     stored = learner.replay.storage[: len(played)]
     assert stored[keys.IS_DEMONSTRATION].all()
     torch.testing.assert_close(stored[key], played[keys.EXPERT_ACTION])
-    assert len(imitated) == (1 if learner.init_loss else 2)
+    assert len(imitated) == (1 if first else 2)
     for label in torch.cat(imitated):
         assert (stored[key] == label).all(dim=-1).any()
 
@@ -190,7 +190,7 @@ def test_a_cloned_policy_explores():
 
     def entropy(weight):
         steps = {"batch_size": 24, "optimizer": {"learning_rate": 3e-3}}
-        learner = build("sac", init="bc", alpha_init=weight, **steps)
+        learner = build("sac", init={"name": "bc", "entropy_weight": weight}, **steps)
         learner.extend(transitions(learner))
         return [float(learner.pretrain_update()["entropy"]) for _ in range(60)][-1]
 
@@ -212,8 +212,7 @@ def demonstration_error(learner):
     ("network", "algorithm", "changes", "message"),
     [
         ("cnn", {"name": "bc"}, {"demonstrations": 0}, "learns from demonstrations only"),
-        ("cnn", {"name": "sac", "init": "bc"}, {}, "pretrain_updates"),
-        ("asr", {"name": "spatial_q", "init": "bc"}, {**OPEN, "pretrain_updates": 1}, "no actor"),
+        ("cnn", {"name": "sac", "init": {"name": "bc"}}, {}, "500 updates of pretraining"),
         ("cnn", {"name": "bc", "replay": {"name": "prioritized"}}, {}, "replay"),
         ("asr", {"name": "bc"}, {}, "network 'asr' is for open_loop"),
         ("cnn", {"name": "dagger", "rotation": {"name": "cn"}}, {}, "rotation.name: 'cn'"),

@@ -18,7 +18,7 @@ from tests.algorithms.tiny import FERM, build, transitions
 RATE, WEIGHT, TAU, ENCODER_TAU = 3e-3, 0.5, 0.2, 0.4
 SETTINGS = {
     **FERM,
-    "contrastive": {"name": "info_nce", "weight": WEIGHT, "pretraining": "contrastive"},
+    "contrastive": {"name": "info_nce", "weight": WEIGHT, "updates": 3},
     "tau": TAU,
     "encoder_tau": ENCODER_TAU,
 }

@@ -98,18 +98,18 @@ def test_two_iterations_of_a_run(tmp_path):
     assert 0 < learner.replay.num_demonstrations < len(learner.replay)
 
 
-@pytest.mark.parametrize(("init", "pretrained"), [("random", 0), ("bc", 3)])
-def test_the_learning_rate_ends_with_the_run(init, pretrained):
+@pytest.mark.parametrize(("init", "first"), [("random", {}), ("bc", {"updates": 3})])
+def test_the_learning_rate_ends_with_the_run(init, first):
     """An update of behaviour cloning is one step, one of RLPD several."""
     schedule = {"learning_rate": 0.003, "learning_rate_end_factor": 0.1}
-    settings = {**UNUSUAL, "optimizer": schedule, "init": init}
+    settings = {**UNUSUAL, "optimizer": schedule, "init": {"name": init, **first}}
     config = parse(ALGORITHMS["rlpd"], settings, "rlpd")
-    task = dataclasses.replace(problem(), total_updates=6, pretrain_updates=3)
+    task = dataclasses.replace(problem(), total_updates=6)
     learner = config.build(CNNConfig(width=0.25), task)
     learner.extend(transitions(learner))
-    for _ in range(pretrained):
+    for _ in range(config.pretraining_updates):
         learner.pretrain_update()
-    for _ in range(5 - pretrained):
+    for _ in range(5 - config.pretraining_updates):
         learner.update()
     rate = learner.optimizer.param_groups[0]["lr"]
     assert rate > 0.15 * 0.003

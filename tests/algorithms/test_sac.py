@@ -5,7 +5,6 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
@@ -120,11 +119,3 @@ def test_the_executed_action_is_the_target_where_the_expert_is_not_asked():
     data[keys.NEXT, keys.FAULT] = torch.zeros(len(data), 1, dtype=torch.bool)
     stored = learner.to_transitions(data, is_demonstration=False)
     assert torch.equal(stored[keys.TARGET_ACTION], data[keys.ACTION])
-
-
-def test_a_replay_with_other_entries_is_refused():
-    learner = tiny.build("rlpd", batch_size=6)
-    learner.extend(tiny.transitions(learner))
-    tiny.build("rlpd", batch_size=6).load_replay_state(learner.replay_state())
-    with pytest.raises(ConfigError, match=r"lack the entry 'target_action'.*another run_dir"):
-        tiny.build("rlpd", batch_size=6, init="bc").load_replay_state(learner.replay_state())

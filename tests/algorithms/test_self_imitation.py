@@ -25,13 +25,13 @@ def collected(learner, done, success):
 def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     learner = build("sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay})
     data = collected(learner, [True, False], [True, False])
-    learner.extend(learner.to_transitions(data, is_demonstration=False))
+    learner.on_collected(data)
     assert learner.replay_size == 1
     batch = learner.sample()
     assert batch[keys.IS_DEMONSTRATION].all()
     assert float(learner.loss(batch)["demonstration_error"]) > 0
     data = collected(learner, [False, True], [False, False])
-    learner.extend(learner.to_transitions(data, is_demonstration=False))
+    learner.on_collected(data)
     assert learner.replay_size == 3
     assert len(learner.episodes) == 1
     other = build("sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay})
@@ -43,7 +43,8 @@ def test_successes_are_imitated_where_the_expert_would_act_otherwise():
     learner = build("sac", imitation=SUCCESSES, batch_size=4)
     data = collected(learner, [True, True], [True, False])
     data[keys.EXPERT_ACTION] = -data[keys.ACTION]
-    stored = learner.to_transitions(data, is_demonstration=False)
+    learner.on_collected(data)
+    stored = learner.replay.storage[:]
     assert stored[keys.IS_DEMONSTRATION][:, 0].tolist() == [True, False]
     assert torch.equal(stored[keys.TARGET_ACTION], data[keys.ACTION])
 
@@ -55,7 +56,7 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
     )
     data = collected(learner, [True, True], [True, True])
     for stored in (2, 4, 6, 8, 10):
-        learner.extend(learner.to_transitions(data, is_demonstration=False))
+        learner.on_collected(data)
         assert learner.replay.num_demonstrations == min(stored, 4)
         assert learner.replay_size == min(stored, 8)
 
@@ -63,9 +64,9 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
 def test_without_the_option_transitions_are_stored_at_once():
     learner = build("sac", batch_size=4)
     data = collected(learner, [True, False], [True, False])
-    stored = learner.to_transitions(data, is_demonstration=False)
-    assert len(stored) == 2
-    assert not stored[keys.IS_DEMONSTRATION].any()
+    learner.on_collected(data)
+    assert learner.replay_size == 2
+    assert learner.replay.num_demonstrations == 0
 
 
 @pytest.mark.parametrize(

@@ -135,7 +135,7 @@ def test_contrastive_pretraining_trains_the_encoder_only():
 
 
 def test_contrastive_pretraining_and_behaviour_cloning_go_together():
-    ferm = build("ferm", "ferm", init="bc")
+    ferm = build("ferm", "ferm", init={"name": "bc"})
     demonstrations = transitions(ferm)
     demonstrations[keys.IS_DEMONSTRATION] = torch.ones_like(demonstrations[keys.IS_DEMONSTRATION])
     ferm.extend(demonstrations)
@@ -162,27 +162,19 @@ def test_imitation_trains_the_convolutions_of_ferm(preset):
     assert all(float(p.grad.abs().max()) > 0 for p in trunk)
 
 
-@pytest.mark.parametrize(("pretraining", "share"), [("contrastive", 0.0), ("all", 4 / 10)])
-def test_importance_weights_start_with_the_losses_of_the_algorithm(pretraining, share, monkeypatch):
-    contrastive = {"name": "info_nce", "pretraining": pretraining}
-    ferm = build("ferm_per", "ferm", contrastive=contrastive)
-    ferm.problem = replace(ferm.problem, pretrain_updates=4)
+@pytest.mark.parametrize(("first", "share"), [(4, 0.0), (0, 4 / 10)])
+def test_importance_weights_start_with_the_losses_of_the_algorithm(first, share, monkeypatch):
+    ferm = build("ferm_per", "ferm", contrastive={"name": "info_nce", "updates": first})
     ferm.extend(transitions(ferm))
     seen, sampler = [], ferm.replay.sampler
     monkeypatch.setattr(sampler, "anneal", seen.append)
     for _ in range(4):
-        ferm.pretrain_update()
+        ferm.pretrain_update() if first else ferm.update()
     ferm.update()
     assert seen[-1] == pytest.approx(share)
     ferm.updates = 9
     ferm.sample()
-    assert seen[-1] == pytest.approx(5 / 6 if pretraining == "contrastive" else 9 / 10)
-
-
-def test_pretraining_of_other_variants_takes_all_losses():
-    sac = build("sacfd", "cnn")
-    sac.extend(transitions(sac))
-    assert "loss_actor" in sac.pretrain_update()
+    assert seen[-1] == pytest.approx(5 / 6 if first else 9 / 10)
 
 
 def test_the_policy_of_ferm_acts_on_the_convolutions_of_the_encoder_without_training_them():

@@ -13,14 +13,3 @@ def test_a_run_starts_with_the_warnings(tmp_path, caplog):
         made.run()
     assert "contrastive has no effect on the encoder of the policy of 'cnn'" in caplog.text
     assert "demonstrations_noise has no effect with demonstrations=0" in caplog.text
-
-
-def test_a_run_of_behaviour_cloning_only_compiles_nothing(tmp_path):
-    settings = {"compile_mode": "default", "pretrain_updates": 2, "demonstrations": 2}
-    made = make_experiment(tmp_path, "cnn", {"name": "sac", "init": "bc"}, **settings)
-    (message,) = made.config.without_effect()
-    assert message == "compile_mode has no effect without updates after those of init: 'bc'"
-    made = make_experiment(
-        tmp_path / "more", "cnn", {"name": "sac", "init": "bc"}, **settings, total_updates=3
-    )
-    assert list(made.config.without_effect()) == []

@@ -195,7 +195,7 @@ def test_an_unknown_plugin_on_the_command_line_is_one_line(name, capsys):
     [
         (
             {"pretrain_updates": 30, "total_updates": 20},
-            r"pretrain_updates \(30\) is part of total_updates \(20\)",
+            r"pretrain_updates \(30\) are part of total_updates \(20\)",
         ),
         ({"min_replay": 100_001}, "min_replay: 100001 transitions are more than the replay holds"),
         ({"algorithm": {"name": "sac", "optimizer": {"learning_rate": math.inf}}}, "learning_rate"),

@@ -63,18 +63,3 @@ def test_overriding_one_method_replaces_one_part(additions):
     learner = Augmented(config.algorithm_config, config.network_config, problem_of(config))
     assert isinstance(learner.replay.transform[0], SO2Augmentation)
     assert learner.target_updater is None
-
-
-def test_pretraining_calls_its_own_update(additions, tmp_path, monkeypatch):
-    taken = []
-
-    def pretrain_update(self):
-        taken.append(self.updates)
-        return self.update()
-
-    learner = additions["behaviour_cloning"].BehaviourCloning
-    monkeypatch.setattr(learner, "pretrain_update", pretrain_update)
-    values = {**RUN, "pretrain_updates": 3, "total_updates": 5, "eval_every": 5}
-    config = ExperimentConfig.parse({**values, "run_dir": str(tmp_path / "run")})
-    assert Experiment(config, progress=False).run().updates == 5
-    assert taken == [0, 1, 2]

@@ -18,7 +18,7 @@ class NoContrastive(Part):
     """The encoder learns from the critics alone."""
 
     name: Literal["none"] = "none"
-    pretraining: ClassVar[str] = "all"
+    updates: ClassVar[int] = 0
 
     def build(self, encoder: nn.Module, images: Mapping[str, ImageSpec]) -> None:
         """Return no loss."""
@@ -31,9 +31,9 @@ class InfoNCE(Part):
     weight: float = Field(default=1.0, gt=0)
     """Factor on the learning rate of the loss's two optimisers. Adam's steps do not depend on a
     factor on the loss. 1 is the reference implementation's; the appendix gives none."""
-    pretraining: Literal["all", "contrastive"] = "all"
-    """Losses that updates before the first collection minimise: all, or the contrastive one alone,
-    with ``init="bc"`` together with that of behaviour cloning."""
+    updates: int = Field(default=0, ge=0)
+    """First updates of a run, on the demonstrations, that minimise this loss instead of the others,
+    together with that of `init` while there is one. `pretrain_updates` does not count them."""
 
     def build(self, encoder: nn.Module, images: Mapping[str, ImageSpec]) -> BilinearInfoNCE:
         """Return the loss of features.
