@@ -9,6 +9,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ba_torchrl.algorithms import base as registries
+from ba_torchrl.commands import train
 from ba_torchrl.core.config import parse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training import hydra_schema
@@ -158,6 +159,36 @@ def test_the_quick_start_for_stacking_composes():
     algorithm = config.algorithm_config
     assert (algorithm.replay.name, algorithm.imitation.name) == ("prioritized", "successes")
     assert (algorithm.imitation.distance, algorithm.imitation.weight) == ("kl", 30.0)
+
+
+@pytest.mark.parametrize(
+    ("words", "part", "options"),
+    [
+        (["algorithm.imitation.name=none"], "imitation", {"name": "none"}),
+        (
+            ["algorithm.imitation.name=successes", "algorithm.imitation.weight=2.0"],
+            "imitation",
+            {"name": "successes", "weight": 2.0, "distance": "kl"},
+        ),
+        (
+            ["algorithm=ferm", "network=ferm", "algorithm.views.name=shift"],
+            "views",
+            {"name": "shift", "pixels": 4, "views": 1, "target_views": 1},
+        ),
+        (["algorithm.imitation.name=none", "algorithm.imitation.weight=2"], "imitation", None),
+    ],
+)
+def test_a_part_that_replaces_that_of_a_preset_keeps_the_values_that_it_has(words, part, options):
+    arguments = train.COMMAND.read(["--config-name=quickstart", *words])
+    hydra_schema.register()
+    with train.COMMAND.composed(arguments) as settings:
+        values = OmegaConf.to_container(settings, resolve=True)
+        if options is None:  # the user's own value
+            with pytest.raises(ConfigError, match=r"unknown.*imitation.name=demonstrations or"):
+                train.parse(values, arguments)
+        else:
+            config = train.parse(values, arguments).algorithm_config
+            assert getattr(config, part).model_dump() == options
 
 
 @pytest.mark.parametrize("network", ["asr", "equi_deictic_asr"])

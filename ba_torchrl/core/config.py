@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from typing import Any, Literal, TypeVar, get_args
 
@@ -166,6 +166,33 @@ def parts_of(annotation: Any) -> dict[str, type[BaseModel]]:
         for each in models
         for name in (names_of(each) if issubclass(each, Part) else [""])
     }
+
+
+def without_replaced(
+    model: type[BaseModel], values: Mapping[str, Any], given: Collection[str]
+) -> dict[str, Any]:
+    """Return the values of a choice without those that belong to a choice which was replaced.
+
+    Args:
+        model: the choice.
+        values: of its fields, some of them from a preset.
+        given: dotted names of the values that override the preset's. Where a ``name`` is among
+            them, fields that this choice does not have are left out, unless they are given too.
+    """
+    names, out = {name.split(".")[0] for name in given}, {}
+    for key, value in values.items():
+        field = model.model_fields.get(key)
+        if field is None and "name" in names and key != "name" and key not in names:
+            continue
+        part = parts_of(field.annotation).get(_name(value)) if field else None
+        below = [name.removeprefix(f"{key}.") for name in given if name.startswith(f"{key}.")]
+        out[key] = without_replaced(part, value, below) if part and below else value
+    return out
+
+
+def _name(value: Any) -> str | None:
+    """Return the name of a choice, "" if it has none, None if the value is not a choice."""
+    return str(value.get("name", "")) if isinstance(value, Mapping) else None
 
 
 def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:

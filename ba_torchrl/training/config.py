@@ -6,7 +6,7 @@ seconds; methods import what needs it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import Field
 
-from ba_torchrl.core.config import MAX_SEED, CompileMode, Source, WorkerOptions, changed, parse
+from ba_torchrl.core.config import (
+    MAX_SEED,
+    CompileMode,
+    Source,
+    WorkerOptions,
+    changed,
+    parse,
+    without_replaced,
+)
 from ba_torchrl.core.errors import ConfigError, PartError, install_command
 from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
@@ -215,13 +223,20 @@ class ExperimentConfig(WorkerOptions):
         return Path(self.run_dir)
 
     @classmethod
-    def parse(cls, values: dict[str, Any], what: str = "experiment") -> ExperimentConfig:
+    def parse(
+        cls, values: dict[str, Any], what: str = "experiment", given: Collection[str] = ()
+    ) -> ExperimentConfig:
         """Validate ``values``, nested parts included.
+
+        Args:
+            values: of the fields.
+            what: is configured, for error messages.
+            given: dotted names of the values that override presets; see `without_replaced`.
 
         Raises:
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
-        config = cls.check_fields(values, what)
+        config = cls.check_fields(values, what)._without_replaced(given)
         if config.resolved_env.config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
         control = config.resolved_env.task_class.control
@@ -274,17 +289,21 @@ class ExperimentConfig(WorkerOptions):
         check_env(config.task, config.env, "env")
         return config
 
+    def _without_replaced(self, given: Collection[str]) -> ExperimentConfig:
+        changes = {}
+        for kind, registry in _registries().items():
+            values = getattr(self, kind)
+            below = [name.removeprefix(f"{kind}.") for name in given if name.startswith(f"{kind}.")]
+            if below and "name" in values:
+                changes[kind] = without_replaced(registry[values["name"]], values, below)
+        return self.model_copy(update=changes)
+
     def _all_plugins(self) -> list[str]:
         """Return `plugins` and the modules that register what the run uses, each once."""
-        from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-        from ba_torchrl.training.collectors.base import COLLECTORS
-
-        used = (
-            (NETWORKS, self.network["name"]),
-            (ALGORITHMS, self.algorithm["name"]),
-            (COLLECTORS, self.collector["name"]),
+        modules = (
+            registry.plugin_module(getattr(self, kind)["name"])
+            for kind, registry in _registries().items()
         )
-        modules = (registry.plugin_module(name) for registry, name in used)
         found = [name for name in modules if name is not None and name not in MAIN]
         return list(dict.fromkeys([*self.resolved_env.modules, *found]))
 
@@ -361,6 +380,14 @@ def _as_device(name: str) -> torch.device:
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")
     return torch.device(name)
+
+
+def _registries() -> dict[str, Any]:
+    """Return the registry of each field that is chosen from one."""
+    from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
+    from ba_torchrl.training.collectors.base import COLLECTORS
+
+    return {"network": NETWORKS, "algorithm": ALGORITHMS, "collector": COLLECTORS}
 
 
 def choose(registry: Any, values: dict[str, Any], kind: str) -> Any:

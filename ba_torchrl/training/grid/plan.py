@@ -19,6 +19,7 @@ from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
     RESULT_FILE,
+    flat,
     read_failure,
     read_result,
 )
@@ -168,16 +169,17 @@ def expand(
         task, algorithm, network, dataset = cell
         if config.skips(task=task, algorithm=algorithm, network=network, dataset=dataset):
             continue
-        values = _merged(
-            {
-                "algorithm": presets["algorithm", algorithm],
-                "network": presets["network", network],
-            },
+        given = _merged(
             common,
             config.per_task.get(task, {}),
             config.per_algorithm.get(algorithm, {}),
             config.per_network.get(network, {}),
         )
+        chosen = {
+            "algorithm": presets["algorithm", algorithm],
+            "network": presets["network", network],
+        }
+        values = _merged(chosen, given)
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
@@ -198,7 +200,7 @@ def expand(
             "resume": True,
         }
         try:
-            runs.append(ExperimentConfig.parse(values))
+            runs.append(ExperimentConfig.parse(values, given=flat(given)))
         except ConfigError as error:
             raise ConfigError(f"{task} with {label}: {error}") from None
     if not runs:

@@ -52,6 +52,16 @@ def test_the_more_specific_override_wins(tmp_path):
     assert PRESETS["network", "small"] == {"name": "cnn", "width": 0.25}
 
 
+def test_another_network_of_one_task_keeps_the_fields_that_it_has(tmp_path):
+    own = {"network": {"name": "equi", "n_hidden": 8}}
+    common = {"algorithm": {"batch_size": 8, "imitation": {"name": "none"}}}
+    (run,) = planned(tmp_path, seeds=1, per_task={REACH: own}, common=common)
+    assert run.network == own["network"]  # without the width of the preset
+    own["network"]["width"] = 0.5
+    with pytest.raises(ConfigError, match="unknown parameter 'width'"):
+        planned(tmp_path, seeds=1, per_task={REACH: own}, common=common)
+
+
 def test_skip_leaves_out_matching_runs(tmp_path):
     runs = planned(
         tmp_path,
