@@ -1,15 +1,33 @@
 import contextlib
 import functools
 import multiprocessing
+import os
+import threading
 
 import pytest
 import torch
 
 from ba_torchrl.core.errors import MissingPackageError
+from ba_torchrl.envs.vector.worker import end_with
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 
 with contextlib.suppress(MissingPackageError):  # else `importorskip("escnn")` skips its tests
     import_escnn()
+
+
+def pytest_configure(config):
+    """Forked processes end with that of the tests, whose end pytest-xdist would not notice."""
+    is_main_thread = True
+
+    def before():
+        nonlocal is_main_thread
+        is_main_thread = threading.current_thread() is threading.main_thread()
+
+    def after_in_child():
+        if is_main_thread:  # else the child would end with the thread
+            end_with(os.getppid())
+
+    os.register_at_fork(before=before, after_in_child=after_in_child)
 
 
 def pytest_collection_modifyitems(items):
