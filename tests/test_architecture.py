@@ -3,8 +3,7 @@
 import re
 from pathlib import Path
 
-from docs import architecture, layout, results
-from docs.sources import Definition
+from docs import architecture, results
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -17,11 +16,6 @@ def test_the_picture_is_drawn_from_the_imports():
 def test_the_page_of_results_has_the_present_results():
     page = results.PAGE.read_text(encoding="utf-8")
     assert results.page_with_results(page) == page, "run `python -m docs.results`"
-
-
-def test_imports_that_follow_from_others_are_left_out():
-    graph = {"a": {"b", "c"}, "b": {"c"}, "c": set()}
-    assert architecture.reduced(graph) == {"a": {"b"}, "b": {"c"}, "c": set()}
 
 
 def test_every_folder_has_a_line():
@@ -38,18 +32,3 @@ def test_examples_and_files_exist():
     ]
     assert [path for path in paths if not (ROOT / path).exists()] == []
     assert len(paths) > 8
-
-
-def test_the_lines_to_read_are_those_of_what_is_named():
-    registry = Definition("ba_torchrl.core.registry", "Registry")
-    error = Definition("ba_torchrl.core.errors", "UnknownNameError")
-    assert error in registry.uses
-    assert error not in layout.to_read(registry, ("ba_torchrl.core.registry",))
-    assert error in layout.to_read(registry, ("ba_torchrl.core.registry", "ba_torchrl.core.errors"))
-    for entry, folders in layout.SUBJECTS.values():
-        assert sum(each.lines for each in layout.to_read(entry, folders)) > 500
-
-
-def test_levels_of_classes_do_not_count_the_base_of_settings():
-    assert layout.levels(Definition("ba_torchrl.core.errors", "UnknownNameError")) == 1
-    assert layout.levels(Definition("ba_torchrl.core.config", "EnvConfig")) == 0

@@ -129,12 +129,6 @@ def test_methods_that_do_not_exist_are_refused(name, message):
         method(name)
 
 
-def test_training_and_quick_start_have_priorities_and_rotation_by_default():
-    for name in ("train", "quickstart"):
-        config = experiment(name).algorithm_config
-        assert (config.replay.name, config.rotation.name) == ("prioritized", "sampled")
-
-
 @pytest.mark.parametrize("name", sorted(path.stem for path in CONFIGS.glob("quickstart*.yaml")))
 def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
     """The values of a quick start are those of its algorithm: sac gets no behaviour term."""
@@ -143,22 +137,6 @@ def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
         config = experiment(name, f"algorithm={algorithm}")
         assert config.label.startswith(f"{algorithm} ")
         assert config.algorithm_config == method(algorithm)
-
-
-def test_the_open_loop_quick_start_composes():
-    config = experiment("quickstart_open_loop", "seed=1")
-    assert config.task == "open_loop/block_stacking"
-    assert config.network_config.scene_head == "pool"
-    assert config.resolved_env.config.num_objects == 3
-
-
-def test_the_quick_start_for_stacking_composes():
-    config = experiment("quickstart_stacking")
-    assert config.task == "close_loop/block_stacking"
-    assert config.resolved_env.config.obs_size == 128
-    algorithm = config.algorithm_config
-    assert (algorithm.replay.name, algorithm.imitation.name) == ("prioritized", "successes")
-    assert (algorithm.imitation.distance, algorithm.imitation.weight) == ("kl", 30.0)
 
 
 @pytest.mark.parametrize(
@@ -189,14 +167,6 @@ def test_a_part_that_replaces_that_of_a_preset_keeps_the_values_that_it_has(word
         else:
             config = train.parse(values, arguments).algorithm_config
             assert getattr(config, part).model_dump() == options
-
-
-@pytest.mark.parametrize("network", ["asr", "equi_deictic_asr"])
-def test_the_quick_start_in_six_degrees_of_freedom_composes(network):
-    config = experiment("quickstart_six_dof", f"network={network}")
-    assert config.task == "ramp/block_stacking"
-    assert config.resolved_env.config.in_hand_mode == "proj"
-    assert (config.network_config.voxel_scale, config.network_config.num_rotations) == (10, 8)
 
 
 @pytest.mark.parametrize("name", ["quickstart", "quickstart_stacking"])

@@ -8,7 +8,6 @@ from PIL import ImageDraw
 from ba_torchrl import make
 from ba_torchrl.commands import tasks
 from ba_torchrl.core import keys
-from ba_torchrl.envs.description import tasks_by_heading
 from ba_torchrl.record.video import FrameRecorder
 from recipes.gallery import COMMAND, Strip, expert_strip, labelled, overview_of, write
 
@@ -80,21 +79,6 @@ def test_a_deconstruction_starts_from_the_goal():
     assert built.first_image.max() < 0.6 * apart.first_image.max()
 
 
-def test_the_same_seed_gives_the_same_strip():
-    first, second = (expert_strip(TASK, seed=0, pictures=3) for _ in range(2))
-    np.testing.assert_array_equal(first.pictures, second.pictures)
-
-
-def test_tasks_are_listed_under_the_heading_of_their_group():
-    tasks = ["mine/push", "bump/a", "open_loop/b", "close_loop/c", "ramp/d", "open_loop/e"]
-    assert tasks_by_heading(tasks) == {
-        "Close loop": ["close_loop/c"],
-        "Open loop": ["open_loop/b", "open_loop/e"],
-        "Six degrees of freedom: ramps, bumps": ["bump/a", "ramp/d"],
-        "mine": ["mine/push"],
-    }
-
-
 def test_an_overview_has_start_and_goal_of_each_task_under_headings(tmp_path, texts, monkeypatch):
     tasks = [f"close_loop/task_{i}" for i in range(3)] + ["ramp/house", "bump/house"]
     monkeypatch.setattr("recipes.gallery.COLUMNS", 2)
@@ -131,16 +115,6 @@ def test_every_open_loop_step_has_a_frame_of_the_contact_and_one_after_it():
         for a, b in zip(recorder.frames, recorder.frames[1:], strict=False)
     ]
     assert min(changes) > 0
-
-
-def test_the_gallery_leaves_the_pictures_of_the_repository_alone(monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    strip = Strip([np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((8, 8), np.float32))
-    monkeypatch.setattr("recipes.gallery.expert_strip", lambda *_, **__: strip)
-    COMMAND.run(["tasks=[close_loop/block_reaching]"])
-    written = [path.relative_to(tmp_path) for path in tmp_path.rglob("*.png")]
-    assert len(written) == 3
-    assert {str(path.parent) for path in written} == {"runs/gallery"}
 
 
 def test_files_that_git_tracks_are_overwritten_only_on_request(monkeypatch, tmp_path, capsys):

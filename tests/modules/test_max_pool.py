@@ -146,7 +146,7 @@ def test_threads_that_outlive_the_main_thread_work_on(tmp_path):
 def test_the_first_use_by_several_threads_keeps_their_number_of_threads():
     for _ in range(20):
         cpu_threads._threads.cache_clear()
-        barrier = Barrier(3)
+        barrier = Barrier(3, timeout=60.0)
 
         def use(_, barrier=barrier):
             barrier.wait()

@@ -5,13 +5,11 @@ import torch
 from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
-from tqdm import tqdm
 
 from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
 from ba_torchrl.objectives.sacfd import SACfDLoss
-from profiling.table import Bench
 from tests.specs import close_loop_images
 
 pytest.importorskip("escnn")
@@ -99,24 +97,3 @@ def test_network_and_losses_are_those_of_sacfd(escnn):
     torch.testing.assert_close(qvalue, expected["loss_qvalue"], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(actor, expected["loss_actor"], rtol=1e-4, atol=1e-6)
     torch.testing.assert_close(-log_prob.mean(), expected["entropy"], rtol=1e-4, atol=1e-6)
-
-
-def test_both_updates_are_measured(monkeypatch):
-    monkeypatch.setattr(escnn_update, "LearningUnit", lambda _: lambda: None)
-    small = {"name": "equi", "group_order": 4, "n_hidden": 4}
-    make = escnn_update.make_learner
-    experiment = {
-        "task": "close_loop/block_reaching",
-        "algorithm": {"name": "sac", "batch_size": 2},
-    }
-    monkeypatch.setattr(
-        escnn_update,
-        "make_learner",
-        lambda bench, *_: make(bench, experiment, small, PIXELS),
-    )
-    monkeypatch.setattr(escnn_update, "SIZE", (4, PIXELS, 4))
-    with tqdm(disable=True) as bar:
-        first, second = escnn_update.measure_escnn(Bench(1, bar))
-    assert second.work == f"{first.work}, escnn's layers"
-    assert first.values[0] > 0
-    assert second.values[0] > 0

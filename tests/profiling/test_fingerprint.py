@@ -8,8 +8,7 @@ from pathlib import Path
 
 import pytest
 
-import ba_torchrl
-from profiling.fingerprint.cases import PARTS, Case, cases
+from profiling.fingerprint.cases import Case
 from profiling.fingerprint.compare import compare, differences
 from profiling.fingerprint.record import run_case
 
@@ -48,18 +47,6 @@ def test_a_changed_number_is_found(case):
     new["traces"]["random"]["steps"][2]["reward"] = ["0" * 16, [0.5]]
     (line,) = differences(old, new)
     assert line == "random: step 2: reward: difference 0.5, [0] -> [0.5]"
-
-
-def test_a_refusal_of_the_configuration_is_recorded(case):
-    refused = dataclasses.replace(case, config={"top_down_approach": True})
-    record = run_case(refused)
-    assert record["facts"]["refused"].startswith("'top_down_approach' is for open-loop")
-
-
-def test_every_task_has_cases_and_names_are_unique():
-    names = [case.name for case in cases(PARTS)]
-    assert len(set(names)) == len(names)
-    assert {case.task for case in cases(["envs"])} == set(ba_torchrl.list_tasks())
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ from tqdm import tqdm
 
 from ba_torchrl.core.config import WorkerOptions
 from profiling import layers, learning, limits, throughput
-from profiling.limits import MatrixProduct, count_multiply_adds
+from profiling.limits import count_multiply_adds
 from profiling.table import COLUMNS, Bench, Budget, Row, as_markdown
 
 
@@ -71,12 +71,6 @@ def test_an_update_has_a_limit_and_the_budget_of_its_instructions(
     assert f"multiply-adds, {precision} matrix product" in row.notes
 
 
-def test_the_matrix_product_has_the_format_of_the_network():
-    product = MatrixProduct(torch.bfloat16, torch.device("cpu"))
-    assert product.multiply_adds == limits.SIZE["cpu"] ** 3
-    assert product.describe([1.0, 2.0, 4.0]) == "bfloat16 matrix product 4.29 G/s"
-
-
 def test_frames_per_second(monkeypatch):
     # Forking is fast; it needs a process without an open simulator, so workers come first.
     vectors = {
@@ -97,36 +91,6 @@ def test_frames_per_second(monkeypatch):
         assert row.multiple == pytest.approx(
             sum(row.values) / 2 * sum(row.unit_s) / 2
         )  # frames during a unit
-
-
-def test_frames_per_second_count_all_environments(monkeypatch):
-    vectors = {"one process": {"workers": WorkerOptions(parallel=False)}}
-    monkeypatch.setattr(throughput, "VECTORS", vectors)
-    monkeypatch.setattr(throughput, "STEPS", 4)
-    monkeypatch.setattr(throughput, "make_vector", lambda *_, **__: None)
-    taken = []
-
-    class Collector:
-        def __init__(self, env, policy, *, frames_per_batch, **_):
-            assert policy is None
-            taken.append(frames_per_batch)
-
-        def __iter__(self):
-            return iter(range(100))
-
-        def shutdown(self):
-            taken.append("closed")
-
-    monkeypatch.setattr(throughput, "Collector", Collector)
-
-    class Halves(Bench):
-        def time_against(self, units, calls, repeats=1):
-            return {name: [0.5, 0.5] for name in {**units, **calls}}
-
-    with tqdm(disable=True) as bar:
-        (row,) = throughput.collection(Halves(2, bar), "close_loop/block_reaching", 5)
-    assert taken == [20, "closed"]
-    assert list(row.values) == [40.0, 40.0]
 
 
 def test_layers_are_measured_in_pairs(monkeypatch):

@@ -79,16 +79,3 @@ def test_criteria_that_are_not_met_are_reported(tmp_path, figures, change, probl
     poor = SoakFigures.model_validate({**figures.model_dump(), **change})
     failures = run_soak([JOB], tmp_path / "s", progress=False, worker=worker(tmp_path, poor))
     assert failures == {JOB.task: problem}
-
-
-@pytest.mark.slow
-def test_a_process_of_the_recipe_measures_a_task(tmp_path):
-    failures = run_soak([JOB], tmp_path, progress=False)
-    assert failures.get(JOB.task, "memory grows") == "memory grows"
-    assert f"| `{JOB.task}` | 60 |" in (tmp_path / TABLE_FILE).read_text()
-
-
-def test_a_deeply_nested_file_of_figures_is_damaged(caplog, tmp_path):
-    (tmp_path / "a.json").write_text(200_000 * "[")
-    assert soak._read(tmp_path / "a.json", SoakJob(task="a", steps=10)) is None
-    assert "is damaged and measured again" in caplog.text

@@ -6,16 +6,11 @@ from tqdm import tqdm
 
 import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.envs.base import BulletArmEnv
-from ba_torchrl.sim.vision import depth
-from profiling import simulation, throughput
+from profiling import throughput
 from profiling.table import (
-    COLUMNS,
     GROUPS,
     MEASUREMENTS,
     Bench,
-    Row,
-    as_markdown,
     measure,
 )
 from tests.recipes import recipe
@@ -43,13 +38,6 @@ def cells(text):
     return header, rows, [row.split("|")[1].strip() for row in rows]
 
 
-def test_the_recipe_prints_a_table(printed_table):
-    header, rows, work = printed_table("simulation/depth_image")
-    assert len(work) == len(set(work)) == 2
-    median = header.split("|").index(" median ")
-    assert all(float(row.split("|")[median].split()[0]) > 0 for row in rows)
-
-
 @pytest.mark.slow
 def test_the_recipe_prints_the_simulation_rows(printed_table):
     _, rows, work = printed_table("simulation")
@@ -71,44 +59,6 @@ def test_memory_is_counted():
     assert all(5 < row.values[0] <= row.budget.must for row in rows)
 
 
-def test_each_timed_image_is_drawn(monkeypatch):
-    drawn = []
-    monkeypatch.setattr(depth, "rasterize_heights", lambda *_: drawn.append(1))
-    compiled = measure("simulation/depth_image", repeats=2, progress=False)[0]
-    assert "compiled" in compiled.work
-    assert len(drawn) > len(compiled.values) == 20
-
-
-def test_the_physics_of_a_step_is_a_part_of_it(monkeypatch):
-    task = "close_loop/block_reaching"
-    monkeypatch.setattr(simulation, "list_tasks", lambda: [task])
-    step, physics = measure("simulation/physics", repeats=2, progress=False)
-    assert physics.work == f"{task}, its physics"
-    assert len(step.values) == len(physics.values) > 2
-    assert all(0 < part < whole for part, whole in zip(physics.values, step.values, strict=True))
-
-
-def test_resets_with_a_seed_are_timed(monkeypatch):
-    monkeypatch.setattr(simulation, "list_tasks", lambda: ["close_loop/object_grasping"])
-    seeds = []
-    reset = BulletArmEnv.reset
-    monkeypatch.setattr(
-        BulletArmEnv,
-        "reset",
-        lambda self, *args, **named: seeds.append(named["seed"]) or reset(self, *args, **named),
-    )
-    (row,) = measure("simulation/seeded_reset", repeats=3, progress=False)
-    assert row.work == "close_loop/object_grasping, reset with a seed"
-    assert len(row.values) == len(seeds) == len(set(seeds)) == 3
-
-
-def test_steps_with_and_without_the_expert_are_taken_in_turns(monkeypatch):
-    monkeypatch.setattr(simulation, "list_tasks", lambda: ["close_loop/block_reaching"])
-    with_expert, without = measure("simulation/expert", repeats=1, progress=False)
-    assert len(with_expert.values) == len(without.values) == len(with_expert.unit_s) > 1
-    assert with_expert.notes.startswith("the action takes ")
-
-
 @pytest.mark.parametrize(
     ("collector", "workers"),
     [("single", 1), pytest.param("multi_sync", 2, marks=pytest.mark.slow)],
@@ -128,11 +78,6 @@ def test_every_measurement_belongs_to_a_group():
         measure("speed", repeats=1)
 
 
-def test_one_measurement_can_be_chosen():
-    (row,) = measure("memory/close_loop_replay", repeats=1, progress=False)
-    assert "close_loop" in row.work
-
-
 def test_a_profile_names_the_operations():
     profiles: dict[str, str] = {}
     matrix = torch.ones(64, 64)
@@ -143,8 +88,3 @@ def test_a_profile_names_the_operations():
     assert set(profiles) == {"product"}
     assert "aten::mm" in profiles["product"]
     assert "[[64, 64], [64, 64]]" in profiles["product"]
-
-
-def test_empty_cells_stay_empty():
-    table = as_markdown([Row("something", "s", [1.0, 2.0, 6.0])], COLUMNS)
-    assert table.splitlines()[-1] == "| something | 2 s | 3 | 1 |  |  |  |  |  |  |"

@@ -1,10 +1,8 @@
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from ba_torchrl.record.plots import Learning, plot_panels
+from tests.fresh import run_script
 
 imageio = pytest.importorskip("imageio.v3")
 
@@ -43,4 +41,4 @@ def test_plots_leave_no_global_state(tmp_path):
         f"plot_panels(curves, [{str(tmp_path / 'curve.png')!r}], names='b');"
         "assert 'matplotlib.pyplot' not in sys.modules"
     )
-    subprocess.run([sys.executable, "-c", code], check=True)
+    run_script(tmp_path, code)

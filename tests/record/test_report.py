@@ -4,7 +4,6 @@ import json
 import re
 import shutil
 import subprocess
-import sys
 from html.parser import HTMLParser
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from ba_torchrl.record.results import (
 )
 from ba_torchrl.record.summary import compare, differing_settings, load_sections, summarize
 from ba_torchrl.training import hydra_schema
+from tests.recipes import recipe
 
 imageio = pytest.importorskip("imageio.v3")
 
@@ -573,17 +573,14 @@ def test_panels_share_colours_and_keep_their_names(tmp_path):
         plot_panels({"a": {"third": Learning((x, x))}}, [path], names=["first"])
 
 
-def test_the_recipe_reports_several_folders(tmp_path):
+def test_the_command_reports_several_folders(tmp_path, capsys):
     for name in ("one", "two"):
         write_run(tmp_path / name / "run", (0.2, 0.7, 0.9), benchmark=name)
-    command = [sys.executable, "recipes/report.py", f"{tmp_path}/one", f"{tmp_path}/two"]
-    command.append("axis=updates")
-    done = subprocess.run(
-        [*command, f"folder={tmp_path}/out"], cwd=ROOT, capture_output=True, text=True
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert "## one" in done.stdout
-    assert f"{tmp_path}/out/report.html" in done.stdout
+    folders = (f"{tmp_path}/one", f"{tmp_path}/two", f"folder={tmp_path}/out")
+    recipe("report", *folders, "axis=updates")
+    out = capsys.readouterr().out
+    assert "## one" in out
+    assert f"{tmp_path}/out/report.html" in out
     assert "updates" in texts(tmp_path / "out/one.svg")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     tables = {"table.csv", "table.md", "table.tex"}

@@ -1,12 +1,9 @@
 """Contacts and distances of boxes with known forces and gaps."""
 
 import math
-import re
-from pathlib import Path
 
 import pytest
 
-import ba_torchrl
 from ba_torchrl.sim.contacts import (
     contacts,
     gap_m,
@@ -90,10 +87,3 @@ def test_gap_and_nearest_points(world, gap):
     assert {point.link for point in points} == {-1}
     assert is_any_within(points, gap + 1e-3)
     assert not is_any_within(points, gap - 1e-3)
-
-
-def test_only_contacts_py_queries_pybullet_contacts():
-    files = sorted(Path(ba_torchrl.__file__).parent.rglob("*.py"))
-    queries = r"getContactPoints|getClosestPoints"
-    found = {path.name for path in files if re.search(queries, path.read_text("utf-8"))}
-    assert found == {"contacts.py"}

@@ -1,20 +1,15 @@
 """Rotations, poses and planar frames, compared with SciPy rotations and homogeneous matrices."""
 
 import math
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-import ba_torchrl
 from ba_torchrl.sim.geometry import (
     IDENTITY,
     PlanarFrame,
     Pose,
-    bullet_compose,
-    bullet_inverse,
     cross,
     dot,
     downward,
@@ -96,18 +91,6 @@ def test_pose_compose_and_inverse(rng):
     assert Pose((0.0, 0.0, 0.0)).orientation == IDENTITY
 
 
-def test_bullet_compose_and_inverse_are_single_precision(rng):
-    outer, inner = random_pose(rng), random_pose(rng)
-    np.testing.assert_allclose(
-        homogeneous(bullet_compose(outer, inner)),
-        homogeneous(outer) @ homogeneous(inner),
-        atol=2e-6,
-    )
-    np.testing.assert_allclose(
-        homogeneous(bullet_inverse(outer)), np.linalg.inv(homogeneous(outer)), atol=2e-6
-    )
-
-
 def _shift(x, y, z):
     shift = np.zeros((4, 4))
     shift[:3, 3] = x, y, z
@@ -153,12 +136,6 @@ def test_dot_cross_and_perpendicular():
 
 
 TRANSFORMS = r"getMatrixFrom|multiplyTransforms|invertTransform|getQuaternionFrom|getEuler"
-
-
-def test_only_geometry_py_computes_rotations():
-    files = sorted(Path(ba_torchrl.__file__).parent.rglob("*.py"))
-    found = {path.name for path in files if re.search(TRANSFORMS, path.read_text("utf-8"))}
-    assert found == {"geometry.py"}
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -1,14 +1,11 @@
 """Meshes as the lists of numbers that PyBullet reads."""
 
-import tracemalloc
-
 import numpy as np
 import pybullet
 import pytest
 
 from ba_torchrl.sim.meshes import Mesh, gable_mesh, rod_mesh, write_obj
 from ba_torchrl.sim.shapes import Solid, mesh_lists
-from ba_torchrl.sim.world import World
 
 MESHES = {"gable": gable_mesh((0.04, 0.1, 0.03)), "rod": rod_mesh(0.1, 0.02)}
 
@@ -39,25 +36,6 @@ def test_equal_meshes_share_their_lists():
     copy = Mesh(np.asfortranarray(mesh.vertices), mesh.faces.astype(np.int32))
     assert mesh_lists(copy) is mesh_lists(mesh)
     assert mesh_lists(Mesh(mesh.vertices * 2, mesh.faces)) is not mesh_lists(mesh)
-
-
-def test_new_worlds_with_the_same_shapes_take_no_more_memory():
-    def build():
-        with World() as world:
-            world.add(Solid(parts=(rod_mesh(0.1, 0.02, sides=200),)), "rod")
-
-    for _ in range(3):
-        build()
-    tracemalloc.start()
-    try:
-        before, _ = tracemalloc.get_traced_memory()
-        for _ in range(20):
-            build()
-        after, _ = tracemalloc.get_traced_memory()
-    finally:
-        tracemalloc.stop()
-    # 20 copies of the 400 vertices alone would be a megabyte
-    assert after - before < 1e5
 
 
 @pytest.mark.parametrize("name", MESHES)

@@ -80,7 +80,8 @@ def _use_one_thread() -> None:
 @cache
 def _threads(count: int) -> ThreadPoolExecutor:
     pool = ThreadPoolExecutor(count, "part-of-a-batch", initializer=_use_one_thread)
-    before, all_started = torch.get_num_threads(), Barrier(count)
+    # with a limit, as a thread that cannot be started would keep the others forever
+    before, all_started = torch.get_num_threads(), Barrier(count, timeout=60.0)
     list(pool.map(lambda _: all_started.wait(), range(count)))
     torch.set_num_threads(before)  # the calls above also set it for threads that start later
     return pool

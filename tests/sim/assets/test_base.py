@@ -54,3 +54,12 @@ def test_an_unknown_set_and_an_unused_folder_are_refused(tmp_path):
         for root in (str(tmp_path), ""):
             with pytest.raises(ConfigError, match="asset_root"):
                 load_object_set(name, root)
+
+
+def test_random_shapes_stand_so_that_fingers_fit_at_yaw_zero():
+    for shape in load_object_set("random")[::6]:
+        low, high = shape.bounds_m
+        vertices = shape.mesh().vertices
+        across = vertices[np.abs(vertices[:, 1]) < hulls.FINGER_HALF_WIDTH_M]
+        assert len(across) == 0 or np.ptp(across[:, 0]) <= hulls.MAX_GAP_M + 1e-3
+        assert high[2] - low[2] >= 0.02 - 1e-6

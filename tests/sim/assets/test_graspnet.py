@@ -9,12 +9,10 @@ import numpy as np
 import pytest
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.sim.assets import decomposition, graspnet, hulls
+from ba_torchrl.sim.assets import hulls
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.graspnet import graspable_scale
 from ba_torchrl.sim.meshes import Mesh, box_mesh, merge_meshes, transform_mesh, write_obj
-from ba_torchrl.tasks.base import CloseLoopTask
-from ba_torchrl.tasks.terrain.tray import profile
 
 
 def write_objects(root, **meshes):
@@ -128,13 +126,6 @@ def test_a_path_with_the_suffix_of_a_mesh_must_be_a_file(tmp_path, make, what):
         load_object_set("graspnet", str(tmp_path / "models"))
 
 
-def test_a_link_to_a_mesh_file_is_followed(tmp_path):
-    root = write_objects(tmp_path / "models", a=box_mesh((0.05, 0.05, 0.05)))
-    (tmp_path / "models" / "b").mkdir()
-    (tmp_path / "models" / "b" / "x.obj").symlink_to("../a/textured.obj")
-    np.testing.assert_allclose(np.ptp(load_object_set("graspnet", root)[1].mesh().vertices), 0.05)
-
-
 def deny(monkeypatch, method, name):
     """Make a method of `Path` raise PermissionError for paths of this name."""
     allowed = getattr(Path, method)
@@ -202,17 +193,6 @@ def test_meshes_of_unsuitable_size_are_refused(tmp_path, own_cache, mesh, messag
     assert not own_cache.exists()  # a cached entry would be read without the check
 
 
-def test_a_mesh_that_is_too_long_is_refused_before_its_decomposition(tmp_path, monkeypatch):
-    iron = angle_iron()
-    long = Mesh(iron.vertices * (1.0, 200.0, 1.0), iron.faces)
-    shapes = load_object_set("graspnet", write_objects(tmp_path / "models", a=long))
-    cut = []
-    monkeypatch.setattr(graspnet, "convex_parts", lambda *_: cut.append(1))
-    with pytest.raises(ConfigError, match="the tray has room"):
-        shapes[0]
-    assert not cut
-
-
 def stepwise_scale(extents):
     """Return the scale, with the documented rules applied step by step."""
     e = np.array(extents, dtype=float)
@@ -232,31 +212,9 @@ def test_meshes_at_the_size_limits_are_accepted(tmp_path, size):
     np.testing.assert_allclose(extents, np.array(size) * stepwise_scale(size), rtol=1e-6)
 
 
-def test_the_longest_object_lies_across_the_smaller_tray():
-    inner = 2 * profile(CloseLoopTask.workspace.width)[0][0]
-    assert inner == pytest.approx(0.25)
-    assert 0.98 < graspnet.MAX_LENGTH_M / math.hypot(inner, inner) <= 1
-
-
 def test_scales_follow_the_rules():
     rng = np.random.default_rng(0)
     for extents in rng.uniform(0.002, 0.5, (300, 3)):
         assert graspable_scale(extents) == pytest.approx(stepwise_scale(extents))
     assert graspable_scale((0.05, 0.05, 0.1)) == 1.0
     assert math.isfinite(graspable_scale((1e-9, 1.0, 1e6)))
-
-
-def test_the_recipe_contains_every_parameter_of_the_decomposition():
-    for value in (
-        decomposition.CONVEX_FILL,
-        decomposition.SOLID_FILL,
-        decomposition.SHEET_FILL,
-        decomposition.EXTENT_TOLERANCE,
-        hulls.MAX_HULL_VERTICES,
-        hulls.HULL_ERROR,
-        graspnet.MESH_LENGTHS_M,
-        graspnet.MAX_LENGTH_M,
-        graspnet.MIN_FLATNESS,
-    ):
-        assert str(value) in graspnet.RECIPE
-    assert all(str(value) in graspnet.RECIPE for value in decomposition.VHACD.values())

@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from ba_torchrl.sim.assets import hulls
-from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.assets.hulls import convex_hull, stable_poses, volume_and_center
 from ba_torchrl.sim.assets.random_shapes import SELECTION, read_shape
 from ba_torchrl.sim.meshes import Mesh
@@ -73,31 +71,6 @@ def select_shapes() -> tuple[tuple[int, float], ...]:
     return tuple((numbers[i], found[numbers[i]].scale) for i in sorted(selected))
 
 
-def test_chosen_random_shapes_have_the_recorded_scale():
-    for number, scale in SELECTION[::20]:
-        found = scaled_candidate(number)
-        assert found is not None
-        assert found.scale == scale
-
-
-def test_unsuitable_random_shapes_are_refused(monkeypatch):
-    assert scaled_candidate(168) is None  # its file contains NaN
-    number, _ = SELECTION[0]
-    for limit, value in (("MAX_LENGTH_M", 0.01), ("MIN_HEIGHT_M", 0.2), ("MIN_FILL", 1.01)):
-        with monkeypatch.context() as patch:
-            patch.setitem(globals(), limit, value)
-            assert scaled_candidate(number) is None
-
-
 @pytest.mark.slow
 def test_the_choice_of_random_shapes_follows_from_the_criterion():
     assert select_shapes() == SELECTION
-
-
-def test_random_shapes_stand_so_that_fingers_fit_at_yaw_zero():
-    for shape in load_object_set("random")[::6]:
-        low, high = shape.bounds_m
-        vertices = shape.mesh().vertices
-        across = vertices[np.abs(vertices[:, 1]) < hulls.FINGER_HALF_WIDTH_M]
-        assert len(across) == 0 or np.ptp(across[:, 0]) <= hulls.MAX_GAP_M + 1e-3
-        assert high[2] - low[2] >= MIN_HEIGHT_M - 1e-6
