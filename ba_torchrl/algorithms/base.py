@@ -36,7 +36,6 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
-from ba_torchrl.modules.layers import compute_dtype
 
 __all__ = [
     "ALGORITHMS",
@@ -49,14 +48,7 @@ __all__ = [
     "Problem",
     "SeedUse",
     "derive_seed",
-    "network_dtype",
 ]
-
-
-def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
-    """Return the number format of a network's convolutions on a device; float32 for a network
-    without the field ``precision``."""
-    return compute_dtype(getattr(network, "precision", "float32"), device)
 
 
 class Learner(ABC):
@@ -76,7 +68,7 @@ class Learner(ABC):
         problem: images, actions, device, seed and length of the run.
 
     Raises:
-        ConfigError: the environment does not observe an image that the network needs.
+        ConfigError: the environment does not observe what the network sees.
         ValueError: the network does not support the images or the actions.
     """
 
@@ -91,20 +83,9 @@ class Learner(ABC):
     def __init__(self, config: LearnerConfig, network: NetworkConfig, problem: Problem) -> None:
         self.config = config
         self.problem = problem
-        missing = [key for key in network.image_keys if key not in problem.images]
-        if missing:
-            raise ConfigError(
-                f"the network sees {', '.join(missing)}; the environment observes "
-                f"{', '.join(problem.images) or 'no images'}"
-            )
-        self.images = {key: problem.images[key] for key in network.image_keys}
+        self.images = _observed(problem.images, network.image_keys, "images")
         """Declarations of the networks' input images, which the replay stores."""
-        if missing := [key for key in network.vector_keys if key not in problem.vectors]:
-            raise ConfigError(
-                f"network.vector_keys: the environment does not observe {', '.join(missing)}; it "
-                f"observes {', '.join(problem.vectors) or 'no vectors'}. env.observations adds some"
-            )
-        self.vectors = {key: problem.vectors[key] for key in network.vector_keys}
+        self.vectors = _observed(problem.vectors, network.vector_keys, "vectors")
         """Lengths of the networks' input vectors, which the replay stores."""
         self.observation_keys = [*self.images, keys.HOLDING, *self.vectors]
         self.codecs = make_codecs(self.images)
@@ -174,14 +155,16 @@ class Learner(ABC):
         return [self.loss]
 
     def make_pretraining(self) -> list[tuple[int, LossFunction]]:
-        """Return numbers of first updates of a run and the loss of each, which these updates
-        minimise instead of the stages; by default none."""
+        """Return numbers of first updates of a run, and the loss that each number of updates
+        minimises instead of the stages; by default none."""
         return []
 
     def due_stages(self) -> Sequence[LossFunction]:
-        """Return the stages of the update that follows `updates` others; by default all. An
-        algorithm that updates its policy less often than its critics leaves one out."""
-        return self.stages
+        """Return the losses of the update that follows `updates` others; by default those of
+        `make_pretraining` if any are due, or all stages. An algorithm that updates its policy less
+        often than its critics leaves one out."""
+        first = [loss for updates, loss in self.pretraining if self.updates < updates]
+        return first or self.stages
 
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
@@ -243,15 +226,7 @@ class Learner(ABC):
         return action
 
     def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
-        """Return collected data as the transitions [N] that the replay stores.
-
-        Args:
-            data: steps of any batch shape, those of an episode in order.
-            is_demonstration: whether they are demonstrations.
-
-        Raises:
-            KeyError: an entry is missing.
-        """
+        """Return steps of any batch shape as the transitions [N] that the replay stores."""
         return as_transitions(
             data,
             self.images,
@@ -278,18 +253,12 @@ class Learner(ABC):
             self.host_tasks.run()  # before its transitions are overwritten: deferred priorities
         self.replay.extend(transitions)
 
-    @property
-    def replay_size(self) -> int:
-        """Number of transitions in the replay."""
-        return len(self.replay)
-
     def sample(self) -> TensorDictBase:
         """Return an augmented batch from the replay on the learner's device."""
-        sampler = self._prioritized_sampler()
-        if sampler is not None:
+        if self._is_prioritized:
             first = self.config.pretraining_updates
             own, total = (n - first for n in (self.updates, self.problem.total_updates))
-            sampler.anneal(max(own, 0) / max(total, 1))
+            self.replay.sampler.anneal(max(own, 0) / max(total, 1))
         batch, device = self.replay.sample(), self.problem.device
         return batch if device.type == "cpu" else batch_to_device(batch, device)
 
@@ -304,7 +273,7 @@ class Learner(ABC):
         """
         batch = self.sample()
         scalars = self.minimize(batch, self.due_stages())
-        if self._prioritized_sampler() is not None:  # whose trees are on the CPU
+        if self._is_prioritized and keys.TD_ERROR in batch:
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)
         return scalars
@@ -320,12 +289,6 @@ class Learner(ABC):
     def _set_priorities(self, errors: dict[str, Tensor]) -> None:
         self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))
 
-    def pretrain_update(self) -> TensorDict:
-        """Take one of the first updates, of the losses of `make_pretraining` that are due. It
-        counts, returns and raises as `update`."""
-        due = [loss for updates, loss in self.pretraining if self.updates < updates]
-        return self.minimize(self.sample(), due)
-
     def minimize(self, batch: TensorDictBase, stages: Sequence[LossFunction]) -> TensorDict:
         """Take the steps of `step`, with its arguments and result, and count the update."""
         before = len(self.host_tasks)
@@ -337,15 +300,8 @@ class Learner(ABC):
         return scalars
 
     def step(self, batch: TensorDictBase, stages: Sequence[LossFunction]) -> TensorDict:
-        """Take the gradient steps on several sums of losses of a batch, then one step of the target
-        network.
-
-        Args:
-            batch: sampled transitions.
-            stages: see `make_stages`.
-
-        Returns:
-            The scalars of all stages, without gradient.
+        """Take the gradient steps on the sums of losses of stages of a batch, then one step of the
+        target network; return the scalars of all stages, without gradient.
 
         Raises:
             FloatingPointError: a loss is not finite.
@@ -367,15 +323,14 @@ class Learner(ABC):
         if self.target_updater is not None:
             self.target_updater.step()
 
-    def _prioritized_sampler(self) -> ExpertPrioritizedSampler | None:
-        sampler = self.replay.sampler
-        return sampler if isinstance(sampler, ExpertPrioritizedSampler) else None
+    @property
+    def _is_prioritized(self) -> bool:
+        return isinstance(self.replay.sampler, ExpertPrioritizedSampler)
 
     # -- state -------------------------------------------------------------------------------
 
     def _stateful_parts(self) -> dict[str, nn.Module]:
-        names = ("loss", "averaged_policy")
-        parts = {name: getattr(self, name) for name in names}
+        parts = {"loss": self.loss, "averaged_policy": self.averaged_policy}
         return {name: part for name, part in parts.items() if part is not None}
 
     def generators(self) -> Mapping[str, torch.Generator]:
@@ -417,3 +372,17 @@ class Learner(ABC):
     def load_replay_state(self, state: dict[str, Any]) -> None:
         """Restore the replay from a `replay_state`."""
         self.replay.load_state_dict(state)
+
+
+def _observed(found: Mapping[str, Any], names: Iterable[str], kind: str) -> dict[str, Any]:
+    """Return what is known of the observations that a network sees.
+
+    Raises:
+        ConfigError: the environment does not observe one.
+    """
+    if missing := [name for name in names if name not in found]:
+        raise ConfigError(
+            f"the network sees {', '.join(missing)}; the environment observes "
+            f"{', '.join(found) or f'no {kind}'}. env.observations adds some"
+        )
+    return {name: found[name] for name in names}

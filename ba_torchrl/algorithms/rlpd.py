@@ -103,8 +103,9 @@ class RLPD(SAC):
 
     def update(self) -> TensorDict:
         """Take the critic updates, the last one together with that of policy and temperature."""
-        for _ in range(self.config.critic_updates - 1):
-            self.step(self.sample(), [self.loss.critic_loss])
+        if self.updates >= self.config.pretraining_updates:
+            for _ in range(self.config.critic_updates - 1):
+                self.step(self.sample(), [self.loss.critic_loss])
         return super().update()
 
     def generators(self) -> dict[str, torch.Generator]:

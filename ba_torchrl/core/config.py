@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from functools import cache
 from typing import Any, Literal, TypeVar, get_args
 
@@ -193,19 +193,6 @@ def without_replaced(
 def _name(value: Any) -> str | None:
     """Return the name of a choice, "" if it has none, None if the value is not a choice."""
     return str(value.get("name", "")) if isinstance(value, Mapping) else None
-
-
-def changed(config: StrictModel, names: Iterable[str], why: str) -> Iterator[str]:
-    """Yield a message for each of some fields, which have no effect, that is not at its default.
-
-    Args:
-        config: the settings.
-        names: of the fields.
-        why: reason: "without a replay".
-    """
-    for name in names:
-        if getattr(config, name) != type(config).model_fields[name].default:
-            yield f"{name} has no effect {why}"
 
 
 class WorkerOptions(StrictModel):
@@ -403,9 +390,9 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
         if self.physics_mode == "custom" and not custom:
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
-        if self.reward != "difference":
-            for message in changed(self, ["reward_discount"], "without reward='difference'"):
-                raise ValueError(message)
+        usual = EnvConfig.model_fields["reward_discount"].default
+        if self.reward != "difference" and self.reward_discount != usual:
+            raise ValueError("reward_discount has no effect without reward='difference'")
         return self
 
     @property

@@ -6,7 +6,7 @@ seconds; methods import what needs it.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+from collections.abc import Collection
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,7 +19,6 @@ from ba_torchrl.core.config import (
     CompileMode,
     Source,
     WorkerOptions,
-    changed,
     parse,
     without_replaced,
 )
@@ -37,14 +36,6 @@ if TYPE_CHECKING:
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
 """Fields of `EnvConfig` that are not for the user to set."""
-
-_OF_DEMONSTRATIONS = (
-    "demonstrations_noise",
-    "demonstrations_turn_noise",
-    "demonstrations_source",
-    "only_successful_demonstrations",
-)
-"""Fields that describe the demonstrations."""
 
 
 class ExperimentConfig(WorkerOptions):
@@ -306,11 +297,6 @@ class ExperimentConfig(WorkerOptions):
         )
         found = [name for name in modules if name is not None and name not in MAIN]
         return list(dict.fromkeys([*self.resolved_env.modules, *found]))
-
-    def without_effect(self) -> Iterator[str]:
-        """Yield a message for each value that has no effect together with the others."""
-        if not self.demonstrations:
-            yield from changed(self, _OF_DEMONSTRATIONS, "with demonstrations=0")
 
     def _check_reward(self) -> None:
         env, gamma = self.resolved_env.config, getattr(self.algorithm_config, "gamma", None)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 
@@ -101,8 +101,6 @@ class Experiment:
             RunStopped: SIGINT or SIGTERM was received, and the state is saved.
         """
         self.state.last_time = self._last_save = time.perf_counter()
-        for message in self.config.without_effect():
-            logger.warning(message)
         with self._signals:  # which last until the state is saved
             try:
                 if not (self.config.resume and self._resume()):
@@ -184,8 +182,7 @@ class Experiment:
         offline = first + config.pretrain_updates if collects else config.total_updates
         with self._phase("pretraining"):
             while algorithm.updates < offline and not self._is_complete:
-                is_first = algorithm.updates < first
-                self._update(algorithm.pretrain_update if is_first else algorithm.update)
+                self._update()
         if self._is_complete:
             return
         with self.state.timed("collection"):
@@ -195,7 +192,7 @@ class Experiment:
             while not self._take_pending_updates():
                 with self.state.timed("collection"):
                     steps = self._store(next(self._collection))
-                if algorithm.replay_size >= config.min_replay:
+                if len(algorithm.replay) >= config.min_replay:
                     self.state.pending_updates = steps * config.updates_per_step
                 self._stop_or_save()
         if algorithm.updates < config.total_updates:
@@ -213,7 +210,7 @@ class Experiment:
         """Take the updates of the last step of collection; return whether the run is complete."""
         while self.state.pending_updates and not self._is_complete:
             self.state.pending_updates -= 1
-            self._update(self.algorithm.update)
+            self._update()
         return self._is_complete
 
     @property
@@ -282,11 +279,11 @@ class Experiment:
         self.algorithm.on_collected(data)
         return state.env_steps // self.config.num_envs - steps_before
 
-    def _update(self, take_update: Callable[[], TensorDict]) -> None:
+    def _update(self) -> None:
         """Take one update; log and evaluate if they are due."""
         self._can_save = False
         with self.state.timed("updates"):
-            scalars = take_update()
+            scalars = self.algorithm.update()
         self._can_save = True
         updates = self.algorithm.updates
         self._bar.update()

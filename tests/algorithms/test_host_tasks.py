@@ -25,7 +25,7 @@ def parameters(learner):
 
 
 def priorities(learner):
-    count = learner.replay_size
+    count = len(learner.replay)
     return torch.as_tensor(learner.replay.sampler._sum_tree[torch.arange(count)]).clone()
 
 

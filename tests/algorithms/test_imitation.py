@@ -105,7 +105,7 @@ def test_any_actor_is_initialised_and_nothing_else(name):
     learner = build(name, init={"name": "bc", "updates": 1}, batch_size=6)
     learner.extend(transitions(learner))
     before = {key: p.detach().clone() for key, p in learner.loss.named_parameters()}
-    scalars = learner.pretrain_update()
+    scalars = learner.update()
     assert set(scalars.keys()) == ({"loss_bc"} if name == "iql" else {"loss_bc", "entropy"})
     assert learner.updates == 1
     after = learner.loss.named_parameters()
@@ -192,7 +192,7 @@ def test_a_cloned_policy_explores():
         steps = {"batch_size": 24, "optimizer": {"learning_rate": 3e-3}}
         learner = build("sac", init={"name": "bc", "entropy_weight": weight}, **steps)
         learner.extend(transitions(learner))
-        return [float(learner.pretrain_update()["entropy"]) for _ in range(60)][-1]
+        return [float(learner.update()["entropy"]) for _ in range(60)][-1]
 
     explores, collapses = entropy(0.03), entropy(1e-9)
     assert explores > collapses + 3

@@ -73,7 +73,7 @@ def test_ferm_takes_the_steps_of_three_optimisers(clamp):
     for number in range(6):
         is_first = number < 3
         torch.manual_seed(number)
-        scalars = learner.pretrain_update() if is_first else learner.update()
+        scalars = learner.update()
         assert ("loss_qvalue" in scalars) is not is_first
         torch.manual_seed(number)
         bound = math.inf if clamp is None else clamp
@@ -97,7 +97,7 @@ def test_every_learning_rate_follows_the_schedule_of_the_run():
                 factor = 1 if name == "optimizer" else WEIGHT
                 assert rates == pytest.approx([factor * expected] * len(rates))
             if number < 10:
-                learner.pretrain_update() if number < 3 else learner.update()
+                learner.update()
 
 
 def test_weight_decay_of_all_optimisers_is_that_of_the_networks():

@@ -107,9 +107,7 @@ def test_the_learning_rate_ends_with_the_run(init, first):
     task = dataclasses.replace(problem(), total_updates=6)
     learner = config.build(CNNConfig(width=0.25), task)
     learner.extend(transitions(learner))
-    for _ in range(config.pretraining_updates):
-        learner.pretrain_update()
-    for _ in range(5 - config.pretraining_updates):
+    for _ in range(5):
         learner.update()
     rate = learner.optimizer.param_groups[0]["lr"]
     assert rate > 0.15 * 0.003

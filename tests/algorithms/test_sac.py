@@ -82,7 +82,7 @@ def test_the_acting_policy_follows_the_learner(demonstrations):
 def test_updates_change_priorities_and_counter_and_imitate(demonstrations):
     sac = build(optimizer={"learning_rate": 3e-3})
     sac.extend(demonstrations)
-    assert sac.replay_size == len(demonstrations)
+    assert len(sac.replay) == len(demonstrations)
     sampler = sac.replay.sampler
     before = sampler._sum_tree[torch.arange(len(demonstrations))]
     errors = []

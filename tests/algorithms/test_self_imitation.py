@@ -26,17 +26,17 @@ def test_transitions_of_successful_episodes_get_the_behaviour_term(replay):
     learner = build("sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay})
     data = collected(learner, [True, False], [True, False])
     learner.on_collected(data)
-    assert learner.replay_size == 1
+    assert len(learner.replay) == 1
     batch = learner.sample()
     assert batch[keys.IS_DEMONSTRATION].all()
     assert float(learner.loss(batch)["demonstration_error"]) > 0
     data = collected(learner, [False, True], [False, False])
     learner.on_collected(data)
-    assert learner.replay_size == 3
+    assert len(learner.replay) == 3
     assert len(learner.episodes) == 1
     other = build("sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay})
     other.load_replay_state(learner.replay_state())
-    assert (other.replay_size, len(other.episodes)) == (3, 1)
+    assert (len(other.replay), len(other.episodes)) == (3, 1)
 
 
 def test_successes_are_imitated_where_the_expert_would_act_otherwise():
@@ -58,14 +58,14 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
     for stored in (2, 4, 6, 8, 10):
         learner.on_collected(data)
         assert learner.replay.num_demonstrations == min(stored, 4)
-        assert learner.replay_size == min(stored, 8)
+        assert len(learner.replay) == min(stored, 8)
 
 
 def test_without_the_option_transitions_are_stored_at_once():
     learner = build("sac", batch_size=4)
     data = collected(learner, [True, False], [True, False])
     learner.on_collected(data)
-    assert learner.replay_size == 2
+    assert len(learner.replay) == 2
     assert learner.replay.num_demonstrations == 0
 
 
@@ -82,7 +82,7 @@ def test_a_run_stores_whole_episodes(tmp_path, collector):
     ended = learner.replay.storage.column((keys.NEXT, keys.DONE)).flatten()
     is_demonstration = learner.replay.storage.column(keys.IS_DEMONSTRATION).flatten()
     successful = learner.replay.storage.column((keys.NEXT, keys.REWARD)).flatten() > 0
-    demonstrated = learner.replay_size + len(learner.episodes) - env_steps
+    demonstrated = len(learner.replay) + len(learner.episodes) - env_steps
     assert demonstrated > 0
     assert is_demonstration[:demonstrated].all()
     assert ended[-1]

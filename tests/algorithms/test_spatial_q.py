@@ -134,7 +134,7 @@ def test_a_restored_learner_continues_identically(transitions):
     assert second.updates == 4
     states = [each.explorer.generator.get_state() for each in (first, second)]
     assert torch.equal(*states)
-    assert second.replay_size == first.replay_size
+    assert len(second.replay) == len(first.replay)
     for _ in range(3):
         one, other = first.update(), second.update()
         assert float(one["loss_qvalue"]) == pytest.approx(float(other["loss_qvalue"]), rel=1e-6)

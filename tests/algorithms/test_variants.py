@@ -46,12 +46,15 @@ PAIRS = [
 ] + [("sacfd_per_so2", "cnn")]
 
 
-def build(preset, network, **changes):
+def build(preset, network, first=0, **changes):
+    """A learner; of FERM, with some first updates of the contrastive loss alone."""
     values = {**method(preset), **changes, "batch_size": 4}
     values["replay"] = {**values["replay"], "capacity": 60}
     sequence = tiny.SIX_DOF if network == "6d_asr" else None
     network = network.removeprefix("6d_")
     problem = tiny.problem(network, sequence)
+    if values.get("contrastive", {}).get("name") == "info_nce":
+        values["contrastive"] = {**values["contrastive"], "updates": first}
     if values.get("views", {}).get("name") == "crop":
         values["views"] = {**values["views"], "size": CROP}
         problem = replace(problem, images=close_loop_images(IMAGE))
@@ -118,10 +121,10 @@ def test_the_options_reach_augmentation_loss_and_target_update():
 
 
 def test_contrastive_pretraining_trains_the_encoder_only():
-    ferm = build("ferm", "ferm", optimizer={"learning_rate": 3e-4})
+    ferm = build("ferm", "ferm", first=61, optimizer={"learning_rate": 3e-4})
     ferm.extend(transitions(ferm))
     before = parameters(ferm)
-    scalars = ferm.pretrain_update()
+    scalars = ferm.update()
     assert list(scalars.keys()) == ["loss_contrastive"]
     assert ferm.updates == 1
     after = parameters(ferm)
@@ -130,17 +133,17 @@ def test_contrastive_pretraining_trains_the_encoder_only():
     encoder = {name for name in after if name.startswith("encoder_network")}
     assert any(".trunk." in name for name in encoder)
     assert changed == encoder | {"contrastive.weight"}
-    losses = [float(ferm.pretrain_update()["loss_contrastive"]) for _ in range(60)]
+    losses = [float(ferm.update()["loss_contrastive"]) for _ in range(60)]
     assert sum(losses[-10:]) < sum(losses[:10])
 
 
 def test_contrastive_pretraining_and_behaviour_cloning_go_together():
-    ferm = build("ferm", "ferm", init={"name": "bc"})
+    ferm = build("ferm", "ferm", first=60, init={"name": "bc"})
     demonstrations = transitions(ferm)
     demonstrations[keys.IS_DEMONSTRATION] = torch.ones_like(demonstrations[keys.IS_DEMONSTRATION])
     ferm.extend(demonstrations)
     before = parameters(ferm)
-    scalars = [ferm.pretrain_update() for _ in range(60)]
+    scalars = [ferm.update() for _ in range(60)]
     assert set(scalars[0].keys()) == {"loss_contrastive", "loss_bc", "entropy"}
     after = parameters(ferm)
     changed = {name for name in after if not torch.equal(after[name], before[name])}
@@ -150,6 +153,11 @@ def test_contrastive_pretraining_and_behaviour_cloning_go_together():
     for loss in ("loss_contrastive", "loss_bc"):
         values = [float(each[loss]) for each in scalars]
         assert sum(values[-10:]) < sum(values[:10])
+
+
+def test_a_contrastive_loss_on_an_encoder_that_the_policy_does_not_share_gives_a_warning(caplog):
+    build("ferm", "cnn")
+    assert "contrastive has no effect on the encoder of the policy of 'cnn'" in caplog.text
 
 
 @pytest.mark.parametrize("preset", ["bc", "dagger"])
@@ -164,12 +172,12 @@ def test_imitation_trains_the_convolutions_of_ferm(preset):
 
 @pytest.mark.parametrize(("first", "share"), [(4, 0.0), (0, 4 / 10)])
 def test_importance_weights_start_with_the_losses_of_the_algorithm(first, share, monkeypatch):
-    ferm = build("ferm_per", "ferm", contrastive={"name": "info_nce", "updates": first})
+    ferm = build("ferm_per", "ferm", first)
     ferm.extend(transitions(ferm))
     seen, sampler = [], ferm.replay.sampler
     monkeypatch.setattr(sampler, "anneal", seen.append)
     for _ in range(4):
-        ferm.pretrain_update() if first else ferm.update()
+        ferm.update()
     ferm.update()
     assert seen[-1] == pytest.approx(share)
     ferm.updates = 9
@@ -262,11 +270,11 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
     assert isinstance(stored, SAC)
     data = transitions(stored)
     stored.extend(data)
-    assert stored.replay_size == 5 * len(data)
+    assert len(stored.replay) == 5 * len(data)
     assert [type(each) for each in stored.replay.transform] == [StoredCopies]
     sampled = build("sacfd_so2", "cnn")
     sampled.extend(data)
-    assert sampled.replay_size == len(data)
+    assert len(sampled.replay) == len(data)
     assert [type(each) for each in sampled.replay.transform] == [SO2Augmentation]
 
 

@@ -65,7 +65,7 @@ def test_the_contrastive_loss_does_not_compare_vectors():
 
 
 def test_what_does_not_fit_is_refused():
-    with pytest.raises(ConfigError, match=r"does not observe proprio; it observes no vectors"):
+    with pytest.raises(ConfigError, match="sees proprio; the environment observes no vectors"):
         build(vectors=("proprio",), observed={})
     for rotation in ("sampled", "stored"):
         with pytest.raises(ConfigError, match="not the network's vectors \\(proprio\\)"):

@@ -134,7 +134,7 @@ def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path, changes)
     assert scalars["train/loss_qvalue"].steps.tolist() == list(range(first, 10))
     assert scalars["demonstrations/success_rate"].steps.tolist() == [0]
     demonstrated = len(experiment.algorithm.replay.storage.column("is_demonstration").nonzero())
-    assert experiment.algorithm.replay_size == demonstrated + 14
+    assert len(experiment.algorithm.replay) == demonstrated + 14
     assert resumable_updates(config.folder) is None
     assert not (config.folder / "resume").exists()
     assert find_checkpoint(config.folder, "latest").name.endswith("9")
@@ -153,7 +153,7 @@ def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_pa
 
     old, new = first.algorithm, second.algorithm
     assert new.updates == 3
-    assert new.replay_size == old.replay_size
+    assert len(new.replay) == len(old.replay)
     for key, value in old.loss.state_dict().items():
         assert torch.equal(new.loss.state_dict()[key], value), key
     states, restored = old.stepper.state_dict(), new.stepper.state_dict()
@@ -169,7 +169,7 @@ def test_learner_replay_priorities_and_generators_are_restored_bit_by_bit(tmp_pa
     if config.algorithm_config.replay.name == "prioritized":
         a, b = (algorithm.replay.sampler.state_dict() for algorithm in (old, new))
         assert torch.equal(a["leaves"], b["leaves"])
-        assert len(set(a["leaves"][: old.replay_size].tolist())) > 3  # not all of them alike
+        assert len(set(a["leaves"][: len(old.replay)].tolist())) > 3  # not all of them alike
         assert a["max_priority"] == b["max_priority"]
         assert a["beta"] == b["beta"]
     for _ in range(3):

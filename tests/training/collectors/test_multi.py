@@ -191,7 +191,7 @@ def test_a_run_keeps_the_ratio_of_updates_to_steps_and_its_statistics(tmp_path):
     assert 4 * 12 <= steps <= 4 * 12 + 4  # one update for each step of all four environments
     storage = experiment.algorithm.replay.storage
     is_demonstration = storage.column("is_demonstration")
-    assert experiment.algorithm.replay_size == int(is_demonstration.sum()) + steps
+    assert len(experiment.algorithm.replay) == int(is_demonstration.sum()) + steps
     assert len(experiment.state.recent) >= 4  # episodes of at most five steps
     scalars = read_scalars(tmp_path / "run")
     assert scalars["collector/lag"].values[-1] <= 3

@@ -76,6 +76,6 @@ def test_a_run_on_a_cluster_ends_like_every_run(tmp_path):
         steps = experiment.state.env_steps
         assert 4 * 12 <= steps <= 4 * 12 + 4
         is_demonstration = experiment.algorithm.replay.storage.column("is_demonstration")
-        assert experiment.algorithm.replay_size == int(is_demonstration.sum()) + steps
+        assert len(experiment.algorithm.replay) == int(is_demonstration.sum()) + steps
         with pytest.raises(ConfigError, match="4 CPUs are needed, the Ray cluster has 2"):
             start(config_for(tmp_path, {**OPTIONS, "workers": 4}))
