@@ -31,7 +31,7 @@ from ba_torchrl.algorithms.problem import Problem, SeedUse, derive_seed
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
+from ba_torchrl.data.replay.codecs import ImageCodecs
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device
 from ba_torchrl.data.transitions import as_transitions
@@ -88,7 +88,6 @@ class Learner(ABC):
         self.vectors = _observed(problem.vectors, network.vector_keys, "vectors")
         """Lengths of the networks' input vectors, which the replay stores."""
         self.observation_keys = [*self.images, keys.HOLDING, *self.vectors]
-        self.codecs = make_codecs(self.images)
         self.host_tasks = HostTasks(problem.device)
         networks = self.make_networks(network)
         policy = self.make_policy(networks)
@@ -103,8 +102,6 @@ class Learner(ABC):
         self.pretraining = self.make_pretraining()
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
-        if problem.device.type != "cpu":
-            self.replay.append_transform(ImageCodecs(self.images, device=problem.device))
         for transform in self.make_transforms():
             self.replay.append_transform(transform)
         self.optimizer = self.make_optimizer()
@@ -172,12 +169,8 @@ class Learner(ABC):
 
     def make_replay(self) -> ReplayBuffer:
         """Return the replay that the configuration names."""
-        return self.config.replay.build(
-            self.config.batch_size,
-            self.codecs,
-            seed=self.problem.derived_seed(SeedUse.REPLAY),
-            returns_codes=self.problem.device.type != "cpu",
-        )
+        seed, size = self.problem.derived_seed(SeedUse.REPLAY), self.config.batch_size
+        return self.config.replay.build(size, self.images, seed, self.problem.device)
 
     def make_transforms(self) -> list[Transform]:
         """Return the transforms of the replay, called on sampled batches and, their inverse, on new
@@ -310,18 +303,14 @@ class Learner(ABC):
         clamp = self.config.optimizer.gradient_clamp
         update = Update(stages, self._check_finite, self.optimizer, clamp)
         scalars = self.stepper.step(update, batch)
-        self.update_target()
+        if self.target_updater is not None:
+            self.target_updater.step()
         return scalars
 
     def _check_finite(self, scalars: TensorDictBase, is_finite: Tensor) -> Tensor | None:
         values = {**scalars, IS_FINITE: is_finite}
         self.host_tasks.submit(values, partial(check_finite, self.updates))
         return is_finite if self.host_tasks.is_deferred else None
-
-    def update_target(self) -> None:
-        """Move the target network, if there is one, after the gradient steps of an update."""
-        if self.target_updater is not None:
-            self.target_updater.step()
 
     @property
     def _is_prioritized(self) -> bool:

@@ -242,7 +242,7 @@ class ExperimentConfig(WorkerOptions):
                 f"({config.total_updates}) and cannot exceed it"
             )
         if offline and not config.demonstrations:
-            raise ConfigError("updates before the first environment step need demonstrations")
+            raise ConfigError("an update before the first environment step needs demonstrations")
         if not config.algorithm_config.collects and not config.demonstrations:
             why = "learns from demonstrations only; set demonstrations"
             raise PartError("algorithm", config.algorithm["name"], why)

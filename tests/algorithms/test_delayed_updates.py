@@ -17,14 +17,14 @@ def flat(parameters):
 def test_a_learner_leaves_out_the_stage_of_its_policy(monkeypatch):
     learner = tiny.build("sac")
     learner.stages = [only(learner.loss, ["loss_qvalue"]), only(learner.loss, ["loss_actor"])]
-    moves = learner.update_target
+    moves = learner.target_updater.step
     kind = type(learner)
 
     def is_due(self):
         return self.updates % 3 == 2
 
     monkeypatch.setattr(kind, "due_stages", lambda self: self.stages[: 1 + is_due(self)])
-    monkeypatch.setattr(kind, "update_target", lambda self: moves() if is_due(self) else None)
+    learner.target_updater.step = lambda: moves() if is_due(learner) else None
     learner.extend(tiny.transitions(learner))
     changed = []
     for _ in range(6):

@@ -5,6 +5,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.core import keys
+from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.record.logging import read_scalars
 from tests.algorithms.tiny import build, run, transitions
 
@@ -110,7 +111,7 @@ def test_the_policy_acts_within_the_range_and_greedily_at_its_mode():
     assert (first.abs() <= 1).all()
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         greedy = learner.policy(state.clone())[keys.ACTION]
-    depth = learner.codecs["depth"](state[keys.DEPTH])  # as the policy sees them
+    depth = make_codecs(learner.images)["depth"](state[keys.DEPTH])  # as the policy sees them
     loc = learner.policy.policy[0](state.clone().set(keys.DEPTH, depth))["loc"]
     torch.testing.assert_close(greedy, loc.tanh())
 

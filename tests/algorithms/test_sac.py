@@ -5,6 +5,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
 from ba_torchrl.core import keys
+from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
@@ -50,7 +51,7 @@ def test_the_policy_writes_nothing_but_the_action_for_any_batch_shape(network, s
 
 def test_the_policy_acts_on_quantised_depth():
     sac = build()
-    codec = sac.codecs["depth"]
+    codec = make_codecs(sac.images)["depth"]
     codes = torch.randint(0, 256, (4, 1, 64, 64), dtype=torch.uint8)
     stored = codec.decode(codes)
     nearby = (stored + (torch.rand_like(stored) - 0.5) * 1.9 * codec.max_error_m).clamp(0)

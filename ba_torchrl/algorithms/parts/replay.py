@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
+import torch
 from pydantic import Field
 
 from ba_torchrl.core.config import Part
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
-from ba_torchrl.data.replay.codecs import ImageCodec
+from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
 from ba_torchrl.data.replay.make import make_replay
 from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 
@@ -24,11 +26,22 @@ class _Replay(Part):
         return {}
 
     def build(
-        self, batch_size: int, codecs: Mapping[str, ImageCodec], **options: Any
+        self, batch_size: int, images: Mapping[str, ImageSpec], seed: int, device: torch.device
     ) -> FrameReplayBuffer:
-        """Return an empty replay; arguments as for `make_replay`."""
+        """Return an empty replay, whose samples have decoded images on a device.
+
+        Args:
+            batch_size: of a sample.
+            images: declarations of the stored images.
+            seed: of the draws.
+            device: of the images; the codes are copied to it.
+        """
         own = self.model_dump(exclude={"name", "capacity", *self.loss_options})
-        return make_replay(self.name, self.capacity, batch_size, codecs=codecs, **own, **options)
+        own |= {"codecs": make_codecs(images), "returns_codes": device.type != "cpu", "seed": seed}
+        replay = make_replay(self.name, self.capacity, batch_size, **own)
+        if device.type != "cpu":
+            replay.append_transform(ImageCodecs(images, device=device))
+        return replay
 
 
 class Uniform(_Replay):
