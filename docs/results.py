@@ -15,8 +15,11 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from matplotlib import rc_context
+from matplotlib.figure import Figure
+
 from ba_torchrl.commands.report import completed
-from ba_torchrl.core.files import write_text
+from ba_torchrl.core.files import replaced, write_text
 from ba_torchrl.envs.description import describe, tasks_by_heading
 from ba_torchrl.record.leaderboard import (
     LEGEND,
@@ -133,6 +136,7 @@ def _difference(row: Mapping[str, object]) -> list[str]:
 
 def _all_tasks(board: Leaderboard) -> Iterator[str]:
     """Yield the lines of the tables of all tasks."""
+    yield "![Success of all tasks](results/tasks.svg)\n"
     yield f"{LEGEND}\n"
     if board.left_out:
         yield from ("Left out:", "", *(f"- {run}" for run in board.left_out), "")
@@ -142,6 +146,35 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
         yield ""
     if board.cells:
         yield _origin([run for group in board.cells.values() for run in group.runs])
+
+
+def plot_tasks(board: Leaderboard, path: Path) -> None:
+    """Plot the success of each task's best method with its interval beside that of the expert."""
+    figure = Figure(figsize=(6.4, 0.21 * len(board.tasks) + 0.9), layout="constrained")
+    headings = tasks_by_heading(board.tasks)
+    heights = [len(tasks) for tasks in headings.values()]
+    panels = figure.subplots(len(headings), 1, sharex=True, squeeze=False, height_ratios=heights)
+    for axes, (heading, tasks) in zip(panels[:, 0], headings.items(), strict=True):
+        axes.set_title(heading, fontsize=8, loc="left")
+        axes.set_yticks(range(len(tasks)), tasks, fontsize=7)
+        axes.set_ylim(len(tasks) - 0.5, -0.5)
+        axes.set_xlim(0, 1.02)
+        axes.grid(axis="x", color="0.9")
+        axes.tick_params(axis="x", labelsize=7)
+        for y, task in enumerate(tasks):
+            score = describe(task).experts.get("kuka")
+            if score:
+                axes.plot(score.success_rate, y, "|", color="0.4", markersize=9)
+            groups = [group for (of, _), group in board.cells.items() if of == task]
+            if groups:
+                rate, low, high = max(group.success for group in groups)
+                axes.plot([low, high], [y, y], color="#0072B2", linewidth=1.5)
+                axes.plot(rate, y, "o", color="#0072B2", markersize=4)
+            else:
+                axes.text(0.01, y, "no policy", fontsize=6, color="0.4", va="center")
+    panels[-1, 0].set_xlabel("success: policy (dot, 95 % interval), expert (bar)", fontsize=8)
+    with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
+        figure.savefig(scratch, metadata={"Date": None})
 
 
 def _rows(board: Leaderboard, task: str) -> Iterator[list[str]]:
@@ -184,6 +217,7 @@ def main() -> None:
         print(f"{add(sys.argv[1:])} records added")
     for name, section in questions().items():
         plot_groups(section.groups, [FOLDER / f"{name}.svg"])
+    plot_tasks(present(), FOLDER / "tasks.svg")
     PAGE.write_text(page_with_results(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
 
