@@ -241,7 +241,7 @@ NO_PRETRAINING = {"pretrain_updates": 0}
 FERM = {
     "name": "sac",
     "views": {"name": "crop", "size": 64},
-    "contrastive": {"name": "info_nce", "pretraining": "contrastive"},
+    "contrastive": {"name": "info_nce", "updates": 2},
 }
 
 
@@ -276,8 +276,10 @@ FERM = {
             "no demonstrations at",
         ),
         ({"network": {"name": "fcn"}}, "network 'fcn' is for open_loop tasks"),
-        ({"algorithm": {"name": "sac", "init": "bc"}, **NO_PRETRAINING}, "init: 'bc' takes effect"),
-        ({"algorithm": FERM, **NO_PRETRAINING}, "pretraining: 'contrastive' takes effect"),
+        (
+            {"algorithm": FERM, "demonstrations": 0, **NO_PRETRAINING},
+            "an update before the first environment step needs demonstrations",
+        ),
     ],
 )
 def test_wrong_configurations_fail_before_the_run_starts(tmp_path, changes, message):
@@ -384,7 +386,7 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
 
 @pytest.mark.parametrize(
     ("view", "reason"),
-    [("camera_side_rgbd", "choose another view_type"), ("camera_center_xy", "values from zero")],
+    [("camera_side_rgbd", "choose another view_type"), ("camera_center_xy", "nothing below zero")],
 )
 def test_views_that_the_networks_do_not_take_are_refused(tmp_path, view, reason):
     config = tiny(tmp_path, env={**TINY["env"], "view_type": view})

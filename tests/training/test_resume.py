@@ -47,10 +47,11 @@ FERM = {
     "algorithm": {
         **UNIFORM,
         "views": {"name": "shift"},
-        "contrastive": {"name": "info_nce", "pretraining": "contrastive"},
+        "contrastive": {"name": "info_nce", "updates": 2},
         "optimizer": {"learning_rate_end_factor": 0.1},
     },
     "network": {"name": "ferm", "width": 0.1, "features": 8},
+    "pretrain_updates": 0,  # two of the contrastive loss instead
 }
 """Changes for optimisers of single terms of the loss, with a schedule."""
 
