@@ -21,6 +21,8 @@ DEMONSTRATIONS = "demos/pulling"
 SHORTER = {
     "agent.learn(10_000)": "agent.learn(102)",
     "n_eval_episodes=20": "n_eval_episodes=1",
+    "n_steps=128": "n_steps=102, batch_size=51, n_epochs=1",
+    "envs.rollout(100,": "envs.rollout(4,",
     "episodes=500)": "episodes=2)",
     "buffer_size=10_000": "buffer_size=200",
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 1,',

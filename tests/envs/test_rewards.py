@@ -13,7 +13,6 @@ import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
-from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import TASKS, Task
 from ba_torchrl.tasks.close_loop.block_picking import BlockPicking
 from ba_torchrl.training.config import ExperimentConfig
@@ -53,14 +52,6 @@ def play(env, seed, *, expert):
 
 def rewards(steps):
     return steps[keys.REWARD].flatten().tolist()
-
-
-def test_the_close_loop_tasks_and_the_structures_have_dense_rewards():
-    assert {name for name in TASKS if name.startswith("close_loop/")} < set(DENSE)
-    sparse = {"bin_packing", "bottle_arrangement", "box_palletizing", "covid_test"}
-    sparse |= {"object_grasping"}
-    assert {name.split("/")[1] for name in TASKS if name not in DENSE} == sparse
-    assert len(DENSE) == 25
 
 
 @pytest.mark.parametrize(
@@ -282,16 +273,6 @@ def test_a_progress_of_any_kind_of_number_is_a_reward(make, monkeypatch, value):
     monkeypatch.setattr(BlockPicking, "progress", lambda _: value)
     state = env.step(state.set(keys.ACTION, torch.zeros(5)))[keys.NEXT]
     assert rewards(state) == [float(value)]
-
-
-def test_a_task_without_a_dense_reward_names_those_that_have_one():
-    with pytest.raises(ConfigError, match=r"bin_packing has no dense reward; it is for .*house_b"):
-        resolve_env("open_loop/bin_packing", {"reward": "difference"})
-
-
-def test_a_discount_without_a_difference_is_refused():
-    with pytest.raises(ConfigError, match=r"reward_discount has no effect without"):
-        resolve_env(PICKING, {"reward": "dense", "reward_discount": 0.9})
 
 
 def test_reversed_episodes_have_the_sparse_reward_only():

@@ -93,6 +93,7 @@ def test_frames_per_second(monkeypatch):
         )  # frames during a unit
 
 
+@pytest.mark.slow
 def test_layers_are_measured_in_pairs(monkeypatch):
     pytest.importorskip("escnn")
     monkeypatch.setattr(layers, "BATCH", 2)

@@ -183,6 +183,7 @@ class TestFailures:
             env.start()
         assert multiprocessing.active_children() == []
 
+    @pytest.mark.slow
     def test_to_import_are_not_retried(self, monkeypatch):
         module = ModuleType("only_in_this_process")
         exec("def make():\n    import fake_env\n    return fake_env.FakeEnv()", vars(module))

@@ -6,7 +6,6 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import UnknownNameError
 from ba_torchrl.sim.geometry import yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.camera_views import (
@@ -58,24 +57,6 @@ def view_input(world, bodies, tool=TOOL, opening=1.0, **setup):
 
 def image(name, *args, **options):
     return VIEWS[name].image(view_input(*args, **options))[-1]
-
-
-def test_registered_views():
-    assert set(VIEWS) == {
-        *TOP_DOWN,
-        *(f"{name}_height" for name in TOP_DOWN),
-        "render_center",
-        "render_center_height",
-        "pers_center_xyz",
-        "camera_side",
-        "camera_side_height",
-        "camera_side_rgbd",
-    }
-
-
-def test_an_unknown_view_raises_and_lists_known_names():
-    with pytest.raises(UnknownNameError, match=r"camera_centre_xyz.*Did you mean.*camera_fix"):
-        VIEWS["camera_centre_xyz"]
 
 
 @pytest.mark.parametrize("task", ["block_picking", "block_pushing"])

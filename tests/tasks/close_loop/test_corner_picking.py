@@ -27,21 +27,6 @@ def test_the_block_is_flush_with_both_walls(env):
         assert task.block.position[2] == pytest.approx(0.027, abs=5e-4)
 
 
-def test_the_corner_has_its_sizes(env):
-    task, camera = env.scene.task, env.scene.camera
-    task.put_corner((0.45, 0.0), 0.0)
-    image = camera.heightmap((0.45, 0.0), 0.24, 120)  # pixels of 2 mm
-    walls = image > 0.07
-    rows, columns = np.nonzero(walls)
-    assert image.max() == pytest.approx(0.08, abs=1e-6)
-    # centred on the edges of the base: inner faces at -9 cm, outer ones at -11 cm
-    assert rows.min() == columns.min() == 5
-    assert rows.max() == columns.max() == 109
-    assert walls[:, 60].sum() == walls[60, :].sum() == 10  # 2 cm thick
-    assert image[60, 60] == pytest.approx(0.002, abs=1e-6)
-    assert image[15 + 12, 15 + 12] == pytest.approx(0.052, abs=5e-4)
-
-
 def test_base_and_walls_do_not_move_and_the_base_is_smooth(env):
     task, scene = env.scene.task, env.scene
     assert task.base.shape.friction == 0.001

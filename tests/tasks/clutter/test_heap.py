@@ -188,17 +188,6 @@ def test_the_heap_is_replaced_after_the_configured_number_of_attempts(make, cont
 
 
 @both_controls
-@pytest.mark.parametrize("count", [1, 5])
-def test_the_default_number_of_attempts_is_that_of_the_reference(make, control, count):
-    env = make(num_objects=count)
-    env.reset()
-    expected = {"close_loop": {1: 2, 5: 8}[count], "open_loop": 30}[control]
-    assert env.scene.task.max_attempts == expected
-    with pytest.raises(ConfigError, match="max_attempts"):
-        make(max_attempts=0)
-
-
-@both_controls
 def test_an_object_outside_the_workspace_ends_the_episode_and_replaces_the_heap(make, control):
     env = make()
     state = env.reset()

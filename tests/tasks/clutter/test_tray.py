@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 
 import ba_torchrl
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M, RIM_Z_M, Tray, profile
+from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M, RIM_Z_M, Tray
 from ba_torchrl.tasks.workspace import Workspace
 
 CENTER = (0.45, 0.02)
@@ -41,11 +40,6 @@ def test_objects_are_placed_on_the_base():
         (base,) = tray.support_ids
         assert world.settle()
         assert base in {body.id for body in world.bodies if body.touches(block)}
-
-
-def test_the_base_is_5_cm_narrower_than_the_workspace():
-    assert profile(0.3)[0][0] == pytest.approx((0.3 - 0.05) / 2)
-    assert profile(0.4)[0][0] - profile(0.3)[0][0] == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("direction", [(1, 0), (-1, 0), (0, 1), (0, -1)])
@@ -114,8 +108,3 @@ def test_the_tray_is_an_option_of_close_loop_tasks():
         assert {"tray floor", "tray walls"} <= {body.name for body in env.scene.world.bodies}
         assert env.scene.task.block.position[2] == pytest.approx(0.025 + FLOOR_Z_M, abs=2e-3)
     env.close()
-
-
-def test_tasks_that_do_not_fit_the_tray_refuse_it():
-    with pytest.raises(ConfigError, match="close_loop_tray"):
-        ba_torchrl.make("close_loop/drawer_opening", close_loop_tray=True)

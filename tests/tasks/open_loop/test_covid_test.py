@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.core.actions import PICK, PLACE, PickPlaceCommand
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.bodies import vertical_extent
 from ba_torchrl.sim.geometry import PlanarFrame, downward
 from ba_torchrl.tasks.open_loop.covid import NEW_BOX, SHEET_M, TEST_AREA, USED_BOX, WALL_M
@@ -167,11 +165,6 @@ def test_fixed_orientations_lie_along_y(make):
         for body in task.objects:
             assert body.yaw_rad == pytest.approx(math.pi / 2, abs=1e-2)
     assert yaws == {0.0, round(math.pi, 6)}
-
-
-def test_objects_that_do_not_fit_their_box_are_refused():
-    with pytest.raises(ConfigError, match="object_scale_range"):
-        ba_torchrl.make(TASK, object_scale_range=0.8)
 
 
 # -- tests -------------------------------------------------------------------------------------

@@ -12,24 +12,11 @@ from ba_torchrl.core.errors import ConfigError, PlacementError
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
 from ba_torchrl.tasks.open_loop.bin_packing import object_shapes
-from ba_torchrl.tasks.open_loop.bottle_arrangement import BOTTLES_CM
 from ba_torchrl.tasks.packing.base import open_box
 from ba_torchrl.tasks.packing.layout import Footprint, scatter
 from ba_torchrl.testing import tasks as checks
 from tests.tasks.episodes import play
 from tests.tasks.packing.scenes import BIN, BOTTLES, BOXES
-
-
-def test_objects_have_the_papers_sizes():
-    for shape in object_shapes(1.0).values():
-        size = np.ptp(shape.vertices, axis=0)
-        assert (size >= (0.0395, 0.0395, 0.0195)).all()
-        assert (size <= (0.0405, 0.0805, 0.0405)).all()
-    assert len(object_shapes(1.0)) == 7
-    for profile in BOTTLES_CM.values():
-        assert 2 * max(r for r, _ in profile) <= 5.0
-        assert 13.0 <= profile[-1][1] <= 14.5
-    assert len(BOTTLES_CM) == 8
 
 
 def test_an_open_box_holds_objects():

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from ba_torchrl.tasks.structures.blueprint import Blueprint, Piece, Slot, tower
+from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, tower
 from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF, TRIANGLE
 from tests.tasks.structures.scenes import BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, rotate
 
@@ -64,8 +64,3 @@ def test_a_long_piece_on_its_side_is_upright_and_on_its_end_is_tilted(scene):
     assert CUBOID.yaw_rad(cuboid) == pytest.approx(0.0, abs=1e-6)
     rotate(cuboid, (1.0, 0.0, 0.0), math.pi / 2, 0.0)
     assert CUBOID.tilt_rad(cuboid) == pytest.approx(math.pi / 2)
-
-
-def test_pieces_compare_by_value():
-    assert Piece("disc", 0.0) == Piece("disc", 0.0)
-    assert len({CUBE, CUBOID, ROOF, TRIANGLE}) == 4

@@ -6,8 +6,6 @@ import numpy as np
 import pytest
 import torch
 
-import ba_torchrl
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.demonstrations.time_reversal import replay_scores
 from ba_torchrl.sim.bodies import vertical_extent, world_vertices
 from ba_torchrl.tasks.structures.pieces import CYLINDER
@@ -38,17 +36,6 @@ def no_op(env):
 # -- pieces ------------------------------------------------------------------------------------
 
 
-def test_sizes_are_the_papers(make_started):
-    blocks = cubes_of(make_started(STACKING).scene.task)
-    assert [block.shape.size_m for block in blocks] == [(0.05, 0.05, 0.05)] * 2
-    task = make_started(HOUSE).scene.task
-    low, high = np.array(triangle_of(task).shape.bounds_m)
-    np.testing.assert_allclose(high - low, 0.05)
-    vertices = triangle_of(task).shape.mesh().vertices
-    ridge = vertices[vertices[:, 2] > 0.02]
-    np.testing.assert_allclose(ridge, [[0, 0.025, 0.025], [0, -0.025, 0.025]])
-
-
 @pytest.mark.parametrize("task", [STACKING, HOUSE])
 def test_the_number_of_pieces_is_configurable(make_started, task):
     for count in (2, 3, 4):
@@ -59,9 +46,6 @@ def test_the_number_of_pieces_is_configurable(make_started, task):
             assert len(points) == count
             apart = [math.dist(a, b) for i, a in enumerate(points) for b in points[:i]]
             assert min(apart) > 0.099
-    for count in (1, 5):
-        with pytest.raises(ConfigError, match="2 to 4"):
-            ba_torchrl.make(task, num_objects=count)
 
 
 def test_with_fixed_orientations_the_fingers_face_the_ends_of_the_triangle(make_started):
@@ -286,12 +270,6 @@ def test_expert_stacks_cylinders_in_the_fewest_steps(settings, steps):
 def test_the_reversed_deconstruction_builds_a_stack_of_cylinders():
     scores = replay_scores(OPEN_STACKING, 5, object_type="cylinder")
     assert scores.reversible * scores.success_rate >= 0.8
-
-
-@pytest.mark.parametrize("task", [STACKING, "open_loop/house_building_1"])
-def test_other_tasks_refuse_cylinders(task):
-    with pytest.raises(ConfigError, match="no meaning"):
-        ba_torchrl.make(task, object_type="cylinder")
 
 
 def test_expert_removes_a_tower_that_blocks_the_grasp_of_the_last_cube(make_started):

@@ -5,14 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from ba_torchrl.tasks.structures.improvise import (
-    CUBOID_M,
-    NUMBERS,
-    SIZES,
-    random_cuboids,
-    random_shapes,
-    shape_piece,
-)
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.planner import next_move
 
@@ -116,24 +108,6 @@ def test_a_house_without_a_storey_is_not_a_success(house, name):
 
 
 # -- improvised houses -------------------------------------------------------------------------
-
-
-def test_shapes_and_cuboids_have_the_sizes_of_the_specification():
-    shapes = random_shapes()
-    assert len(shapes) == len(NUMBERS) * SIZES
-    assert {number for number, _ in shapes} == set(NUMBERS)
-    for _, shape in shapes:
-        low, high = np.array(shape.bounds_m)
-        assert 0.025 < high[2] - low[2] < 0.031
-        assert low[2] == pytest.approx(-high[2])
-        assert min(high[:2] - low[:2]) > 0.036
-        assert max(high[:2] - low[:2]) < 0.092
-        (yaw,) = shape_piece(shape).grasp_yaws_rad
-        across = shape.vertices[:, :2] @ (math.cos(yaw), math.sin(yaw))
-        assert np.ptp(across) < 0.085  # it fits between the open fingers
-    for cuboid in random_cuboids():
-        for edge, (least, most) in zip(cuboid.size_m, CUBOID_M, strict=True):
-            assert least <= edge <= most
 
 
 @pytest.mark.parametrize("name", IMPROVISED)
