@@ -45,8 +45,8 @@ def test_freed_pages_are_kept():
     results, tuned = count_faults("tuned")
     assert results == [True, True]
     _, untuned = count_faults("untuned")
-    # Huge pages make the count on the untuned side depend on the kernel's settings.
-    assert tuned < 20 < untuned
+    # with huge pages, 160
+    assert tuned < untuned / 4 > 20
 
 
 @pytest.mark.parametrize(

@@ -69,7 +69,7 @@ def test_the_frames_of_a_runs_collector_are_counted(collector, workers, monkeypa
         (row,) = throughput.run_collection(Bench(2, bar), collector, workers)
     assert f"collector={collector}, {workers} worker" in row.work
     assert len(row.values) == len(row.unit_s) == 2
-    assert min(row.values) > 1
+    assert min(row.values) > 0
 
 
 def test_every_measurement_belongs_to_a_group():
