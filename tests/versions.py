@@ -208,12 +208,12 @@ def updates() -> list[tuple[str, object]]:
         return {**values, **({"width": 0.25} if has_width else {})}
 
     def one_update(control: str, algorithm: str, network: str) -> None:
+        first = {"contrastive": {"name": "info_nce", "updates": 1}} if algorithm == "ferm" else {}
         values = {
             "task": "ramp/block_stacking" if "deictic" in network else usual[control][0],
             "env": {"obs_size": 142 if algorithm == "ferm" else 64},
-            "algorithm": {**presets["algorithm"][algorithm], "batch_size": 2},
+            "algorithm": {**presets["algorithm"][algorithm], "batch_size": 2, **first},
             "network": small(presets["network"][network]),
-            "pretrain_updates": 1,
         }
         check_update(values)
 

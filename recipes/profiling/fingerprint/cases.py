@@ -301,6 +301,7 @@ def _training_case(
     small = SMALL_CLOSE_LOOP if TASKS[task].control == "close_loop" else SMALL_OPEN_LOOP
     if method.startswith("ferm"):
         small = {**small, "env.obs_size": 71, "algorithm.views.size": 64}
+        small |= {"algorithm.contrastive.updates": 8, "pretrain_updates": 0}
     config = {
         "file": file,
         "task": task,
