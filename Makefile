@@ -36,10 +36,12 @@ setup: $(STAMP)
 train: $(STAMP)
 	$(BIN)/ba-torchrl train --config-name quickstart $(ARGS)
 
-# One process per core, each with one thread: numeric libraries would fight over the cores. The tests
-# of a file run in one process, which builds their environments and kernels once. A test that ends
-# its process is repeated in a new one, by default four times per core.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --dist loadfile --max-worker-restart 1
+# One process per core, each with one thread: numeric libraries would fight over the cores. At most
+# eight, which take 12 GB. The tests of a file run in one process, which builds their environments
+# and kernels once. A test that ends its process is repeated in a new one, by default four times per
+# core.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n auto --maxprocesses 8 --dist loadfile \
+	--max-worker-restart 1
 
 test: $(STAMP)
 	$(PYTEST) $(ARGS)
