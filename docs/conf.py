@@ -5,6 +5,7 @@ make docs
 
 from __future__ import annotations
 
+import json
 import shutil
 from collections.abc import Iterable, Mapping
 from html.parser import HTMLParser
@@ -23,6 +24,7 @@ from ba_torchrl.envs.description import describe, expert_scores, summary, tasks_
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.policy import read_card, shipped_file, shipped_policies
+from docs.notebook import markdown, notebook
 
 project, author, release = "BA-TorchRL", "The BA-TorchRL authors", __version__
 extensions = [
@@ -122,6 +124,9 @@ def write_pages() -> None:
         lines += ["", "```{toctree}", ":hidden:", *pages, "```", ""]
     (GENERATED / "tasks.md").write_text("\n".join(lines), encoding="utf-8")
     (GENERATED / "fields.md").write_text(fields_page(), encoding="utf-8")
+    script = (FOLDER / "tutorials" / "sac.py").read_text(encoding="utf-8")
+    (GENERATED / "sac.inc").write_text(markdown(script), encoding="utf-8")
+    (GENERATED / "sac.ipynb").write_text(json.dumps(notebook(script), indent=1), encoding="utf-8")
 
 
 def task_page(task: str) -> str:

@@ -16,17 +16,23 @@ from ba_torchrl.core.errors import ConfigError
 from tests.fresh import run_script
 
 ROOT = Path(__file__).resolve().parents[1]
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
-DEMONSTRATIONS = "demos/pulling"
+PAGES += TUTORIALS
+TEMPLATES = ROOT / "templates"
+DEMONSTRATIONS = "demos/picking"
 SHORTER = {
     "agent.learn(10_000)": "agent.learn(102)",
     "n_eval_episodes=20": "n_eval_episodes=1",
     "n_steps=128": "n_steps=102, batch_size=51, n_epochs=1",
     "envs.rollout(100,": "envs.rollout(4,",
     "episodes=500)": "episodes=2)",
+    "range(5000)": "range(5)",
+    "range(10_000, 10_050)": "range(1)",
+    "policy, 100, seed=0)": "policy, 5, seed=0)",
     "buffer_size=10_000": "buffer_size=200",
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 1,',
-    '"mine/tall_block", 4)': '"mine/tall_block", 1)',
+    '"mine/stack_on_plateau", 4)': '"mine/stack_on_plateau", 1)',
 }
 """Parts of the pages' Python that take minutes or many processes, and what runs instead."""
 
@@ -40,24 +46,26 @@ def scripts() -> list[tuple[str, str, str]]:
     """Return the name of each script, its source, and the modules that its page shows.
 
     A block that begins with a docstring is a module, `my_tasks`. One that imports something
-    starts a script; one that does not continues it.
+    starts a script, on the page of a tutorial the first one; others continue it.
     """
     found = []
     for page in PAGES:
         python = blocks(page, "python")
         modules = "".join(block for block in python if block.startswith('"""'))
+        is_begun = False
         for block in python:
             if block.startswith('"""'):
                 continue
-            if re.match(r"(?s).*^(import|from) ", block, re.MULTILINE):
+            if not is_begun and re.match(r"(?s).*^(import|from) ", block, re.MULTILINE):
                 found.append([f"{page.name} {len(found)}", "", modules])
+                is_begun = page in TUTORIALS
             found[-1][1] += block
     return [tuple(script) for script in found]
 
 
-def command_lines() -> list[tuple[str, str]]:
+def command_lines(pages: list[Path] = PAGES) -> list[tuple[str, str]]:
     found = set()
-    for page in PAGES:
+    for page in pages:
         lines = (
             "".join([*blocks(page, ""), *blocks(page, "bash")]).replace("\\\n", " ").splitlines()
         )
@@ -96,10 +104,13 @@ def test_brackets_in_a_command_of_a_help_or_a_configuration_are_quoted(capsys):
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory):
-    """Return a folder with two episodes, as `ba-torchrl collect` writes it."""
-    folder = tmp_path_factory.mktemp("demos") / "pulling"
-    words = ["task=close_loop/block_pulling", "episodes=2", "num_envs=1", "parallel=false"]
-    importlib.import_module("ba_torchrl.commands.collect").COMMAND.run([*words, f"path={folder}"])
+    """Return a folder with two episodes, as the page's `ba-torchrl collect` writes it."""
+    folder = tmp_path_factory.mktemp("demos") / "picking"
+    page = ROOT / "docs" / "tutorials" / "cloning.md"
+    (line,) = (line for _, line in command_lines([page]) if f" path={DEMONSTRATIONS}" in line)
+    words = line.replace(DEMONSTRATIONS, str(folder)).replace("=100", "=2").split()[2:]
+    words += ["num_envs=1", "parallel=false"]
+    importlib.import_module("ba_torchrl.commands.collect").COMMAND.run(words)
     return folder
 
 
@@ -110,6 +121,8 @@ def test_python_of_a_page_runs(script, modules, tmp_path, request):
     for long, short in SHORTER.items():
         script = script.replace(long, short)
     (tmp_path / "my_tasks.py").write_text(modules)
+    for path in TEMPLATES.glob("my_*.py"):
+        shutil.copy(path, tmp_path)
     if DEMONSTRATIONS in script:
         shutil.copytree(request.getfixturevalue("demonstrations"), tmp_path / DEMONSTRATIONS)
     run_script(tmp_path, script)
@@ -120,6 +133,11 @@ def test_python_of_a_page_runs(script, modules, tmp_path, request):
 )
 def test_command_line_of_a_page_is_valid(page, line, tmp_path, monkeypatch, cached_presets):
     monkeypatch.chdir(tmp_path)
+    check_command_line(line)
+
+
+def check_command_line(line: str) -> None:
+    """Check that a command line reaches its work, which is not done."""
     line = line.replace("$SLURM_ARRAY_TASK_ID", "0").replace("TASK", "close_loop/block_picking")
     name, *words = shlex.split(line)[1:]
     if name == "--help" or "--help" in words:

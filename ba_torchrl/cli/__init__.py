@@ -81,10 +81,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def config_dir() -> Path:
-    """Return the folder of the configurations: in the installed package, or in a clone."""
+    """Return the folder of the configurations."""
+    return data_dir("configs")
+
+
+def data_dir(name: str) -> Path:
+    """Return a folder that is beside the package in a clone, and in the installed package."""
     package = _FOLDER.parent
-    installed = package / "configs"
-    return installed if installed.is_dir() else package.parent / "configs"
+    installed = package / name
+    return installed if installed.is_dir() else package.parent / name
 
 
 def _missing(command: str, error: ModuleNotFoundError) -> str | None:

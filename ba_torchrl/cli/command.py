@@ -66,7 +66,7 @@ class Command:
     settings: type[BaseModel]
     """Model of the settings. Without ``config``, its defaults are those of the command."""
     positional: str | None = None
-    """Field that words without "=" set."""
+    """Field that words without "=" set, or several, "kind name", each set by one word."""
     config: str | None = None
     """Name of the configuration file that is used unless ``--config-name`` is given."""
     variants: str = ""
@@ -120,8 +120,8 @@ class Command:
         return False
 
     def _help(self, values: dict[str, Any], with_choices: bool) -> str:
-        word = f" [{self.positional.upper()}]" if self.positional else ""
-        usage = f"{self.name}{word} [FIELD=VALUE ...]"
+        words = "".join(f" [{name.upper()}]" for name in (self.positional or "").split())
+        usage = f"{self.name}{words} [FIELD=VALUE ...]"
         text = sys.modules[self.main.__module__].__doc__ or ""
         return describe(usage, text, self.settings, values, self.config_names(), with_choices)
 
@@ -157,7 +157,7 @@ class Command:
         overrides = [word for word in rest if word[:1] != "-" and ("=" in word or word[:1] == "~")]
         bare = [word for word in rest if word[:1] != "-" and word not in overrides]
         if bare and not is_for_hydra:  # else they are values of its options
-            overrides.append(self._positional(bare, overrides))
+            overrides += self._positional(bare, overrides)
         return Arguments(overrides, found.config_name, found.config_dir, found.help, is_for_hydra)
 
     def _refuse(self, option: str, words: Sequence[str]) -> NoReturn:
@@ -176,15 +176,18 @@ class Command:
             value = "VALUE" if following.startswith("-") or "=" in following else following
         raise ConfigError(f"unknown option {option!r}: write {shlex.join([f'{name}={value}'])}")
 
-    def _positional(self, words: Sequence[str], overrides: Sequence[str]) -> str:
-        """Return the override of the positional field by words without "="."""
-        if self.positional is None:
-            raise ConfigError(f"{words[0]!r} sets nothing; settings are FIELD=VALUE, see --help")
-        if any(override.startswith(f"{self.positional}=") for override in overrides):
-            raise ConfigError(f"{self.positional} is given twice")
-        quoted = ["'" + word.replace("'", "\\'") + "'" for word in words]
-        value = quoted[0] if len(quoted) == 1 else f"[{','.join(quoted)}]"
-        return f"{self.positional}={value}"
+    def _positional(self, words: Sequence[str], overrides: Sequence[str]) -> list[str]:
+        """Return the overrides of the positional fields by words without "="."""
+        names = (self.positional or "").split()
+        if not names or len(words) > len(names) > 1:
+            raise ConfigError(f"{words[-1]!r} sets nothing; settings are FIELD=VALUE, see --help")
+        for name in names[: len(words)]:
+            if any(override.startswith(f"{name}=") for override in overrides):
+                raise ConfigError(f"{name} is given twice")
+        values = ["'" + word.replace("'", "\\'") + "'" for word in words]
+        if len(values) > len(names):
+            values = [f"[{','.join(values)}]"]
+        return [f"{name}={value}" for name, value in zip(names, values, strict=False)]
 
     @contextmanager
     def composed(self, arguments: Arguments) -> Iterator[DictConfig]:

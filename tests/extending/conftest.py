@@ -1,4 +1,4 @@
-"""The additions of ``mine/``, registered for the tests of this folder only."""
+"""The additions of ``mine/`` and ``templates/``, registered for the tests of this folder only."""
 
 import importlib
 import sys
@@ -14,7 +14,10 @@ from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
 
 HERE = Path(__file__).parent
-MODULES = sorted(path.stem for path in (HERE / "mine").glob("*.py"))
+TEMPLATES = HERE.parents[1] / "templates"
+FOLDERS = [str(HERE), str(TEMPLATES)]
+MODULES = sorted(f"mine.{path.stem}" for path in (HERE / "mine").glob("*.py"))
+MODULES += sorted(path.stem for path in TEMPLATES.glob("my_*.py"))
 REGISTRIES = (TASKS, ROBOTS, OBSERVATIONS, NETWORKS, ALGORITHMS)
 
 
@@ -24,11 +27,11 @@ def additions():
     assert all(map(len, REGISTRIES))  # all that is built in is registered
     before = [(dict(registry._entries), dict(registry._modules)) for registry in REGISTRIES]
     ids = set(gymnasium.registry)
-    sys.path.insert(0, str(HERE))
+    sys.path[:0] = FOLDERS
+    yield {name.split(".")[-1]: importlib.import_module(name) for name in MODULES}
     for name in MODULES:
-        sys.modules.pop(f"mine.{name}", None)
-    yield {name: importlib.import_module(f"mine.{name}") for name in MODULES}
-    sys.path.remove(str(HERE))
+        del sys.modules[name]
+    sys.path[:] = [folder for folder in sys.path if folder not in FOLDERS]
     for registry, (entries, modules) in zip(REGISTRIES, before, strict=True):
         registry._entries, registry._modules = entries, modules
     for new in set(gymnasium.registry) - ids:

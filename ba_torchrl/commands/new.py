@@ -1,0 +1,74 @@
+"""Write the module of a task, an algorithm or a network of your own, and its test.
+
+ba-torchrl new task push_far         # push_far.py and test_push_far.py in this folder
+ba-torchrl new algorithm my_method
+ba-torchrl new network my_network
+"""
+
+from __future__ import annotations
+
+import keyword
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Literal
+
+from ba_torchrl.cli import data_dir
+from ba_torchrl.cli.command import Command
+from ba_torchrl.cli.types import check_new, check_writable_file, checked
+from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.errors import ConfigError
+
+TRAIN = "ba-torchrl train --config-name quickstart 'plugins=[{name}]'"
+NEXT = {
+    "task": (
+        "ba-torchrl play 'plugins=[{name}]' task=mine/{name} video={name}.gif",
+        f"{TRAIN} task=mine/{{name}}",
+    ),
+    "algorithm": (
+        f"{TRAIN} task=close_loop/block_reaching algorithm=mine/{{name}} network=cnn_small "
+        "demonstrations_noise=0",
+    ),
+    "network": (f"{TRAIN} network=mine/{{name}}",),
+}
+"""What to type after the test, by kind of module."""
+
+
+def check_module(name: str) -> None:
+    """Check that a new module of this folder can have a name."""
+    if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
+        raise ConfigError(f"{name!r} is no name of a module: lower-case letters, digits and _")
+    for path in files(name):
+        check_new(path)
+        check_writable_file(path)
+    if find_spec(name) is not None:
+        raise ConfigError(f"another module has the name {name!r}; choose another one")
+
+
+def files(name: str) -> list[str]:
+    """Return the names of the files of a module and of its test."""
+    return [f"{name}.py", f"test_{name}.py"]
+
+
+class Settings(StrictModel):
+    """Settings of this command."""
+
+    kind: Literal["task", "algorithm", "network"]
+    """Of the module."""
+    name: Annotated[str, checked(check_module)]
+    """Of the module, such as my_task; what it registers is mine/my_task."""
+
+
+def main(settings: Settings) -> None:
+    """Write the files."""
+    kind, name = settings.kind, settings.name
+    old, camel = f"my_{kind}", "".join(map(str.capitalize, name.split("_")))
+    for path, template in zip(files(name), files(old), strict=True):
+        text = (data_dir("templates") / template).read_text(encoding="utf-8")
+        text = text.replace(old, name).replace(f"My{kind.capitalize()}", camel)
+        Path(path).write_text(text, encoding="utf-8")
+    print(f"{' and '.join(files(name))} are written. Next:")
+    for line in (f"python -m pytest test_{name}.py", *NEXT[kind]):
+        print(f"  {line.format(name=name)}")
+
+
+COMMAND = Command(main, Settings, positional="kind name")

@@ -1,0 +1,80 @@
+"""The scripts and the notebook of docs/tutorials, and the modules that `ba-torchrl new` writes."""
+
+import sys
+from pathlib import Path
+
+import pytest
+
+from ba_torchrl import cli
+from docs.notebook import notebook
+from tests.fresh import run_script
+
+FOLDER = Path(__file__).parents[1] / "docs" / "tutorials"
+LONG = "STEPS, RANDOM_STEPS, EVERY, EPISODES = 12_000, 500, 1000, 50"
+SHORT = "STEPS, RANDOM_STEPS, EVERY, EPISODES = 40, 20, 40, 1"
+
+
+def script(name):
+    text = (FOLDER / f"{name}.py").read_text()
+    assert LONG in text
+    return text.replace(LONG, SHORT)
+
+
+def test_the_script_of_sac_trains_from_images(tmp_path):
+    code = script("sac").replace('"images" in sys.argv[1:]', "True")
+    out = run_script(tmp_path, code).stdout
+    assert "40 steps, 0.0 minutes of CPU time: success rate " in out
+    assert "test: success rate " in out
+
+
+def test_the_notebook_of_sac_trains_from_poses():
+    nbformat, nbclient = pytest.importorskip("nbformat"), pytest.importorskip("nbclient")
+    found = nbformat.from_dict(notebook(script("sac")))
+    nbformat.validate(found)
+    assert [cell.cell_type for cell in found.cells[:2]] == ["markdown", "code"]
+    nbclient.NotebookClient(found, timeout=240, kernel_name="python3").execute()
+    assert "test: success rate " in found.cells[-1].outputs[-1].text
+
+
+@pytest.mark.parametrize("kind", ["task", "algorithm", "network"])
+def test_what_the_command_writes_passes_its_own_test(kind, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", list(sys.path))  # the command adds the folder
+    cli.main(["new", kind, "push_far"])
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[:2] == [
+        "push_far.py and test_push_far.py are written. Next:",
+        "  python -m pytest test_push_far.py",
+    ]
+    text = (tmp_path / "push_far.py").read_text() + (tmp_path / "test_push_far.py").read_text()
+    assert '.register("mine/push_far")' in text
+    assert "my_" not in text.lower()
+    commands = [line for line in lines[2:] if line.startswith("  ba-torchrl ")]
+    code = (
+        "import pytest\nfrom tests.test_pages import check_command_line\n"
+        f"for line in {commands}:\n    check_command_line(line)\n"
+        "raise SystemExit(pytest.main(['-q', 'test_push_far.py']))\n"
+    )
+    assert "passed" in run_script(tmp_path, code).stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["task", "mine"], "mine.py exists already"),
+        (["task", "json"], "another module has the name 'json'"),
+        (["task", "a-b"], "'a-b' is no name of a module"),
+        (["tasks", "a"], "kind: Input should be 'task', 'algorithm' or 'network'"),
+        (["task"], "name is missing"),
+        (["task", "a", "b"], "'b' sets nothing"),
+        (["task", "kind=network"], "kind is given twice"),
+    ],
+)
+def test_the_command_refuses(words, message, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    Path("mine.py").write_text("x = 1\n")
+    with pytest.raises(SystemExit):
+        cli.main(["new", *words])
+    assert message in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["mine.py"]
+    assert Path("mine.py").read_text() == "x = 1\n"
