@@ -1,8 +1,9 @@
-"""An actor-critic for close-loop tasks that sees where features are (spatial softmax)."""
+"""An actor-critic for close-loop tasks whose features are points in the scene (spatial softmax)."""
 
 from typing import ClassVar
 
 import torch
+import torch.nn.functional as F
 from torch import nn
 
 from ba_torchrl.core.config import StrictModel
@@ -19,17 +20,20 @@ class Features(nn.Module):
             *[nn.Conv2d(spec.image_channels, width, 5, 2, 2), nn.ReLU()],
             *[nn.Conv2d(width, width, 3, 2, 1), nn.ReLU(), nn.Conv2d(width, width, 3, 1, 1)],
         )
-        self.size = 2 * width + 1 + spec.vector_size
+        self.size = 3 * width + 1 + spec.vector_size
 
     def forward(self, depth, *others):
-        """Return the mean row and column of each feature map's softmax, and the other inputs."""
+        """Return the mean row, column and depth of each feature map's softmax, and the others."""
         batch = depth.shape[:-3]
         depth = (depth - self.config.depth_center_m) / self.config.depth_scale_m
-        maps = self.maps(depth.reshape(batch.numel(), *depth.shape[-3:]))
-        weights = maps.flatten(2).softmax(-1).unflatten(-1, maps.shape[-2:])
+        depth = depth.reshape(batch.numel(), *depth.shape[-3:])
+        maps = self.maps(depth)
+        weights = (maps.flatten(2) / self.config.temperature).softmax(-1).reshape(maps.shape)
         axis = torch.linspace(-1, 1, maps.shape[-1], device=maps.device)
-        means = torch.cat([weights.sum(3) @ axis, weights.sum(2) @ axis], -1)
-        return torch.cat([means.reshape(*batch, -1), *(other.float() for other in others)], -1)
+        depths = F.adaptive_avg_pool2d(depth[:, :1], maps.shape[-2:])
+        means = [weights.sum(3) @ axis, weights.sum(2) @ axis, (weights * depths).sum((2, 3))]
+        points = torch.cat(means, -1).reshape(*batch, -1)
+        return torch.cat([points, *(other.float() for other in others)], -1)
 
 
 def perceptron(inputs, outputs, hidden):
@@ -75,6 +79,8 @@ class MyNetworkConfig(StrictModel):
     width: int = 32
     """Feature maps."""
     hidden: int = 128
+    temperature: float = 0.1
+    """Of the softmax: small values attend to one place."""
     depth_center_m: float = 0.2
     depth_scale_m: float = 0.1
 
