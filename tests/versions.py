@@ -4,11 +4,11 @@ python tests/versions.py                                   # make test-versions
 python tests/versions.py --pythons 3.12 --sets newest nightly --folder /tmp/versions
 python tests/versions.py --inside                          # in this environment
 
-An environment has the package's wheel with the extra [train], and escnn. In it: experts of four
-tasks, one update of each algorithm and of each network, environments in processes, and the quick
-start cut short. The table of results is printed; an environment that exists is used again. The
-set "pinned" has the versions of requirements.txt, "nightly" the latest builds of TorchRL and
-tensordict on top of the newest; a failure of the latter is only printed.
+An environment has the package's wheel with the extra [train]. In it: experts of four tasks, one
+update of each algorithm and of each network, environments in processes, and the quick start cut
+short. The table of results is printed; an environment that exists is used again. The set "pinned"
+has the versions of requirements.txt, "nightly" the latest builds of TorchRL and tensordict on top
+of the newest; a failure of the latter is only printed.
 """
 
 from __future__ import annotations
@@ -32,7 +32,6 @@ CONSTRAINTS = {
 }
 """Constraints of each set of versions."""
 NIGHTLY = ("tensordict", "torchrl")
-ESCNN = "escnn==1.0.11"
 SHOWN = ("torch", "torchrl", "tensordict", "numpy", "pybullet", "gymnasium", "numba", "pydantic")
 EXPERTS = (
     "close_loop/block_picking",
@@ -96,7 +95,7 @@ def run(python: str, name: str, folder: Path) -> list[str]:
 
 
 def install(python: str, name: str, folder: Path) -> None:
-    """Install the package's wheel and escnn into a new environment."""
+    """Install the package's wheel into a new environment."""
     subprocess.run([f"python{python}", "-m", "venv", "--clear", str(folder)], check=True)
     pip = [str(folder / "bin/python"), "-m", "pip", "install", "--quiet"]
     file = CONSTRAINTS[name]
@@ -107,7 +106,6 @@ def install(python: str, name: str, folder: Path) -> None:
         subprocess.run([*build, "--wheel-dir", wheels, str(ROOT)], check=True)
         (wheel,) = Path(wheels).glob("*.whl")
         subprocess.run([*pip, *constraints, f"{wheel}[train]"], check=True)
-    subprocess.run([*pip, "--no-deps", ESCNN], check=True)
     if name == "nightly":
         subprocess.run([*pip[:3], "uninstall", "--quiet", "--yes", *NIGHTLY], check=True)
         nightly = [f"{each}-nightly" for each in NIGHTLY]

@@ -29,7 +29,6 @@ OF_TRAINING = (
     "imageio",
     "imageio-ffmpeg",
     "pillow",
-    "joblib",
 )
 """Packages of the extra [train]."""
 _FOLDER = Path(__file__).parents[1] / "commands"

@@ -106,7 +106,7 @@ def _escnn() -> Finding:
     try:
         import_escnn()
     except MissingPackageError as error:
-        return Finding("escnn", "not usable: no equivariant networks", error.fix)
+        return Finding("escnn", f"the package's own kernels, as {error.what} (optional)")
     return Finding("escnn", _version("escnn") or "without version")
 
 

@@ -101,7 +101,6 @@ class NetworkConfig(Protocol):
             spec: images and action, an `ActorCriticSpec` or a `SpatialSpec`.
 
         Raises:
-            ImportError: escnn is missing; the message names the fix.
             ValueError: the network does not support the size or kind of an image or the components
                 of the action, or they do not fit its hyper-parameters.
         """

@@ -10,7 +10,6 @@ from pydantic import ValidationError
 from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import compute_dtype
-from tests.fresh import run_script
 from tests.modules.networks import ACTOR_CRITICS, count
 from tests.modules.networks import actor_critic as small
 from tests.specs import actor_critic_spec
@@ -175,35 +174,3 @@ def test_what_cannot_be_built_is_refused(name, fields, spec, message):
 def test_bad_action_sequences_are_refused(sequence):
     with pytest.raises(ValueError, match="action_sequence"):
         actor_critic_spec(64, sequence)
-
-
-def test_missing_escnn_names_the_fix(tmp_path):
-    """The registry can be imported without escnn; building an equivariant network needs it."""
-    code = """
-import sys
-sys.modules["escnn"] = None
-from ba_torchrl.core.errors import MissingPackageError
-from ba_torchrl.modules import layers
-from ba_torchrl.modules.base import NETWORKS
-from tests.specs import actor_critic_spec, spatial_spec
-actor_critic, spatial = actor_critic_spec(), spatial_spec()
-NETWORKS["cnn"](width=0.1).build(actor_critic)
-for name in ("fcn", "rot_fcn", "asr"):
-    NETWORKS[name](width=0.1).build(spatial)
-for name, spec in (("equi", actor_critic), ("equi_fcn", spatial), ("equi_asr", spatial)):
-    try:
-        NETWORKS[name]().build(spec)
-    except MissingPackageError as error:
-        assert "pip install --no-deps escnn==1.0.11" in str(error), error
-    else:
-        raise SystemExit(f"built {name} without escnn")
-del sys.modules["escnn"]
-sys.modules["joblib"] = None  # which escnn imports
-try:
-    NETWORKS["equi"]().build(actor_critic)
-except MissingPackageError as error:
-    assert "equivariant networks need joblib: pip install " in str(error), error
-else:
-    raise SystemExit("built equi without joblib")
-"""
-    run_script(tmp_path, code)

@@ -19,9 +19,8 @@ OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
 @pytest.mark.parametrize(
     ("name", "package", "overrides"),
     [
-        ("train", "escnn", ("network=equi", "algorithm=sac", "run_dir=new")),
-        ("train", "escnn", ("network=equi_fcn", *OPEN, "run_dir=new")),
-        ("benchmark", "escnn", ("benchmark=close_loop_small", "folder=new")),
+        ("train", "matplotlib", ("network=equi", "algorithm=sac", "run_dir=new")),
+        ("train", "imageio", ("network=equi_fcn", *OPEN, "run_dir=new")),
     ],
 )
 def test_a_missing_package_is_one_line(name, package, overrides, capsys, monkeypatch, tmp_path):

@@ -11,10 +11,12 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from ba_torchrl.modules.steerable.irrep_convolution import IrrepKernels, irrep_kernels
+from ba_torchrl.modules.steerable.planar import PlanarSpace, sampled_kernels
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 
 if TYPE_CHECKING:
@@ -32,7 +34,7 @@ class KernelBlock:
     Args:
         kernels: float32 [D, O, K, K, I], escnn's normalised basis, input channels last.
         in_irreps: for each of the D kernels, the input irrep that it reads.
-        out_irreps: for each kernel, the position of the output irrep that it writes.
+        out_irreps: for each kernel, the index of the output irrep that it writes.
     """
 
     kernels: Tensor
@@ -57,12 +59,26 @@ class KernelBlock:
 
 @cache
 def kernel_block(
-    gspace: GSpace2D, in_repr: Representation, out_repr: Representation, kernel_size: int
+    gspace: GSpace2D | PlanarSpace,
+    in_repr: Representation,
+    out_repr: Representation,
+    kernel_size: int,
 ) -> KernelBlock | None:
     """Return the kernels between two representations, None if there are none.
 
-    Built once per process: escnn's construction takes up to a second for large groups.
+    Built once per process: the construction takes up to a second for large groups.
     """
+    if isinstance(gspace, PlanarSpace):
+        found = sampled_kernels(in_repr, out_repr, kernel_size)
+        if not found:
+            return None
+        kernels = torch.tensor(np.stack([kernel.values for kernel in found]), dtype=torch.float32)
+        kernels = kernels.unflatten(-1, (kernel_size, kernel_size)).permute(0, 1, 3, 4, 2)
+        return KernelBlock(
+            kernels=kernels.contiguous(),
+            in_irreps=tuple(kernel.in_irrep for kernel in found),
+            out_irreps=tuple(kernel.out_index for kernel in found),
+        )
     nn = import_escnn("escnn.nn")
     types = nn.FieldType(gspace, [in_repr]), nn.FieldType(gspace, [out_repr])
     try:

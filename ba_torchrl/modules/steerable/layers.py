@@ -1,9 +1,9 @@
 """Steerable convolutions on escnn's kernel bases, with plain tensors in and out.
 
-escnn builds the bases; the layers here hold the coefficients and expand them in every forward
-pass, or once inside `reuse_filters`. Outside of it no filter is kept, so none is outdated when
-weights are copied in place, and ``state_dict``, ``deepcopy`` and functional calls see ordinary
-parameters only.
+escnn builds the bases, or `planar` where it is not installed; the layers here hold the
+coefficients and expand them in every forward pass, or once inside `reuse_filters`. Outside of it no
+filter is kept, so none is outdated when weights are copied in place, and ``state_dict``,
+``deepcopy`` and functional calls see ordinary parameters only.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.core.errors import MissingPackageError
 from ba_torchrl.modules.steerable.cpu_threads import is_plain_float32
 from ba_torchrl.modules.steerable.irrep_convolution import (
     IrrepKernels,
@@ -31,6 +32,7 @@ from ba_torchrl.modules.steerable.kernels import (
     kernel_block,
     regular_irrep_kernels,
 )
+from ba_torchrl.modules.steerable.planar import PlanarSpace, planar_space
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 
 if TYPE_CHECKING:
@@ -57,14 +59,23 @@ def reuse_filters() -> Iterator[None]:
         _expanded.reset(token)
 
 
-def planar_rotations(order: int) -> GSpace2D:
-    """Return escnn's space of planar images under the rotations of the cyclic group C_order."""
-    return import_escnn("escnn.gspaces").rot2dOnR2(order)
+def planar_rotations(order: int) -> GSpace2D | PlanarSpace:
+    """Return the space of planar images under the rotations of the cyclic group C_order.
+
+    It is escnn's, or where escnn is not installed one of the same representations.
+    """
+    try:
+        return import_escnn("escnn.gspaces").rot2dOnR2(order)
+    except MissingPackageError:
+        return planar_space(order, has_flips=False)
 
 
-def planar_rotations_and_flips(order: int) -> GSpace2D:
-    """Return escnn's space of planar images under the dihedral group of 2 order elements."""
-    return import_escnn("escnn.gspaces").flipRot2dOnR2(order)
+def planar_rotations_and_flips(order: int) -> GSpace2D | PlanarSpace:
+    """Return the space of planar images under the dihedral group, as `planar_rotations`."""
+    try:
+        return import_escnn("escnn.gspaces").flipRot2dOnR2(order)
+    except MissingPackageError:
+        return planar_space(order, has_flips=True)
 
 
 def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representation]:

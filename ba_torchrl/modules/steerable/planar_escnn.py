@@ -21,9 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from ba_torchrl.core.errors import MissingPackageError, install_command
+from ba_torchrl.core.errors import MissingPackageError
 
-ESCNN_FIX = "pip install --no-deps escnn==1.0.11"
+ESCNN_FIX = "pip install --no-deps escnn==1.0.11 joblib"
 _NAMES = ("lie_learn", "representations", "SO3", "wigner_d")
 
 
@@ -46,8 +46,7 @@ def import_escnn(name: str = "escnn") -> ModuleType:
     except ImportError as error:
         other = (error.name or "").split(".")[0]  # a package that escnn imports
         missing = other or "escnn"
-        fix = ESCNN_FIX if missing == "escnn" else install_command(missing)
-        raise MissingPackageError(f"equivariant networks need {missing}", fix) from error
+        raise MissingPackageError(f"{missing} is not installed", ESCNN_FIX) from error
     # scikit-learn's singular value decomposition refuses the matrices that escnn gives it; where
     # scikit-learn is not installed, escnn takes SciPy's.
     numerical.randomized_svd = None
