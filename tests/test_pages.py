@@ -13,6 +13,7 @@ import pytest
 from ba_torchrl.cli import command_names, main
 from ba_torchrl.cli.command import Command
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.envs.observations import vector_names
 from tests.fresh import run_script
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -172,3 +173,8 @@ def test_links_of_a_page_have_targets(page):
     for target in map("".join, links):
         if not target.startswith(("http:", "https:")):
             assert (page.parent / target).exists(), target
+
+
+def test_the_page_of_environments_names_the_numbers_of_the_pose_vector():
+    text = (ROOT / "docs/environments.md").read_text()
+    assert re.findall(r"`(opening|(?:tool|object_0)_\w+)`", text) == vector_names(1)

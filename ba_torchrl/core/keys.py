@@ -8,7 +8,8 @@ IN_HAND = "in_hand"
 """[1 or 3, h, w] float32. Open loop: image of the held object, zero if there is none."""
 OBSERVATION = "observation"
 """[1 + 4 + 4 n] float32, with ``obs_type="vec"``: gripper opening in [-1, 1], then x, y, z scaled
-to [-1, 1] by the workspace and yaw over pi, of the gripper and of each of n objects."""
+to [-1, 1] by the workspace and yaw over pi, of the gripper and of each of n objects; see
+`ba_torchrl.envs.observations.vector_names`."""
 RGB = "rgb"
 """[3, H, W] uint8: RGB image of the scene, arm included."""
 WRIST_RGB = "wrist_rgb"

@@ -89,6 +89,19 @@ def merge_entries(parts: list[dict]) -> dict:
     return entries
 
 
+def vector_names(objects: int = 1) -> list[str]:
+    """Return the names of the numbers of ``obs_type="vec"``, in order.
+
+    ``opening`` of the gripper is from -1 (closed) to 1; ``x``, ``y`` and ``z`` are from -1 to 1
+    within the workspace; ``yaw`` is in radians over pi.
+
+    Args:
+        objects: number of the task's `landmarks`: its objects, and goals or containers.
+    """
+    owners = ["tool", *(f"object_{number}" for number in range(objects))]
+    return ["opening", *(f"{owner}_{axis}" for owner in owners for axis in ("x", "y", "z", "yaw"))]
+
+
 @OBSERVATIONS.register("vec")
 class PoseVector(Observation):
     """The poses of the gripper and the task's landmarks, and the opening of the gripper."""
@@ -102,7 +115,7 @@ class PoseVector(Observation):
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specification of the vector."""
-        length = 1 + 4 * (1 + len(scene.task.landmarks))
+        length = len(vector_names(len(scene.task.landmarks)))
         return {keys.OBSERVATION: Unbounded((length,), device="cpu", dtype=torch.float32)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:

@@ -11,6 +11,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import CUSTOM_PHYSICS
+from ba_torchrl.envs.observations import vector_names
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.sim.vision.camera_views import VIEWS
 from ba_torchrl.tasks.base import TASKS
@@ -257,17 +258,21 @@ def test_obs_type_vec_lists_scaled_poses(make):
     state = env.reset()
     assert keys.DEPTH not in state
     task, robot = env.scene.task, env.scene.robot
-    expected = [2 * robot.opening() - 1]
-    for position, yaw in (
-        robot.tool_pose(),
-        (task.block.position, task.block.yaw_rad),
-        (task.goal.position, task.goal.yaw_rad),
-    ):
+    expected = {"opening": 2 * robot.opening() - 1}
+    for owner, (position, yaw) in {
+        "tool": robot.tool_pose(),
+        "object_0": (task.block.position, task.block.yaw_rad),
+        "object_1": (task.goal.position, task.goal.yaw_rad),
+    }.items():
         low, high = np.array([0.3, -0.15, 0.01]), np.array([0.6, 0.15, 0.25])
-        expected += [*(2 * (np.array(position) - low) / (high - low) - 1), yaw / math.pi]
-    np.testing.assert_allclose(state[keys.OBSERVATION], expected, atol=1e-6)
+        scaled = 2 * (np.array(position) - low) / (high - low) - 1
+        expected |= {f"{owner}_{axis}": value for axis, value in zip("xyz", scaled, strict=True)}
+        expected[f"{owner}_yaw"] = yaw / math.pi
+    names = vector_names(2)
+    found = dict(zip(names, state[keys.OBSERVATION].tolist(), strict=True))
+    assert found == pytest.approx(expected, abs=1e-6)
     moved = act(env, state, x=1.0)[keys.OBSERVATION] - state[keys.OBSERVATION]
-    assert moved[1] == pytest.approx(0.05 / 0.15, abs=5e-3)
+    assert moved[names.index("tool_x")] == pytest.approx(0.05 / 0.15, abs=5e-3)
 
 
 def test_view_types_show_the_same_scene_differently(make):
