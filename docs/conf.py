@@ -17,7 +17,7 @@ from pydantic import BaseModel
 from sphinx.application import Sphinx
 from sphinx.util import logging
 
-from ba_torchrl import __version__, list_robots, list_tasks
+from ba_torchrl import __version__, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.core.config import EnvConfig
 from ba_torchrl.envs.description import describe, expert_scores, summary, tasks_by_heading
@@ -40,9 +40,15 @@ myst_heading_anchors = 3
 myst_fence_as_directive = ["mermaid"]
 viewcode_follow_imported_members = False  # with it, the sources link back to wrong names
 autodoc_member_order = "bysource"
-autodoc_typehints = "description"
+autodoc_preserve_defaults = True
+default_role = "py:obj"
+python_maximum_signature_line_length = 80
+python_use_unqualified_type_names = True
+autodoc_default_options = {"exclude-members": "model_config"}
 html_theme = "furo"
 html_title = "BA-TorchRL"
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 exclude_patterns = ["_build", "results/**", "tasks.md"]
 
 logger = logging.getLogger(__name__)
@@ -54,7 +60,27 @@ GENERATED = FOLDER / "generated"
 def setup(app: Sphinx) -> None:
     """Make the generated pages before Sphinx looks for its sources; check what it has built."""
     app.connect("config-inited", lambda *_: write_pages())
+    app.connect("autodoc-process-signature", without_fields)
+    app.connect("autodoc-process-docstring", keep_colons, priority=100)
     app.connect("build-finished", check_site)
+
+
+def without_fields(
+    app: Sphinx, what: str, name: str, obj: object, options: object, *texts: str | None
+) -> tuple[str, None] | None:
+    """Leave the fields of a pydantic model out of its signature: each is described below it."""
+    if isinstance(obj, type) and issubclass(obj, BaseModel):
+        return "", None
+    return None
+
+
+def keep_colons(
+    app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
+) -> None:
+    """Break the first line of an attribute's text at a colon, else what precedes it is its type."""
+    if what in ("attribute", "data", "property") and lines:
+        first, colon, rest = lines[0].partition(": ")
+        lines[:1] = [first + colon.strip(), rest] if colon else [first]
 
 
 class _Page(HTMLParser):
@@ -108,18 +134,21 @@ def write_pages() -> None:
     for task in list_tasks():
         page = GENERATED / "tasks" / f"{_slug(task)}.md"
         page.write_text(task_page(task), encoding="utf-8")
-    scores, robots = expert_scores(), list_robots()
-    lines = ["# Tasks", "", "Below the names of robots: success rate of the task's expert.", ""]
+    lines = [
+        "# Tasks",
+        "",
+        "The last column has the success rates of the expert on four robots.",
+        "",
+    ]
     for heading, tasks in groups.items():
-        columns = ["", "task", "goal", *robots]
-        lines += [f"## {heading}", "", f"| {' | '.join(columns)} |", "|---" * len(columns) + "|"]
+        lines += [f"## {heading}", "", "| | task and goal | expert |", "|---|---|---|"]
         for task in tasks:
-            found = (scores[task].get(robot) for robot in robots)
-            rates = ("–" if score is None else f"{score.success_rate:.3f}" for score in found)
+            rates = [score.success_rate for score in expert_scores()[task].values()]
+            span = dict.fromkeys(f"{rate:.3f}" for rate in (min(rates), max(rates)))
             page, picture = f"tasks/{_slug(task)}.md", f"![](../gallery/{_slug(task)}.png)"
             goal = summary(task)
-            cells = [picture, f"[`{task}`]({page})", goal[:1].upper() + goal[1:], *rates]
-            lines.append(f"| {' | '.join(cells)} |")
+            text = f"[`{task}`]({page})<br>{goal[:1].upper()}{goal[1:]}"
+            lines.append(f"| {picture} | {text} | {' to '.join(span)} |")
         pages = (f"tasks/{_slug(task)}" for task in tasks)
         lines += ["", "```{toctree}", ":hidden:", *pages, "```", ""]
     (GENERATED / "tasks.md").write_text("\n".join(lines), encoding="utf-8")
@@ -130,18 +159,25 @@ def write_pages() -> None:
 
 
 def task_page(task: str) -> str:
-    """Return the page of a task: picture, film, description, expert and trained policy."""
+    """Return the page of a task: film, description, expert and trained policy."""
     found, slug = describe(task), _slug(task)
-    film = FOLDER / "gallery" / f"{slug}.gif"
-    picture = film if film.exists() else film.with_suffix(".png")
-    lines = [f"# {task}", "", f"![{task}](../../gallery/{picture.name})", "", found.text, ""]
+    pictures = {
+        f"{slug}.webp": "Film: the policy that the package ships.",
+        f"{slug}_expert.webp": "Film: the expert.",
+        f"{slug}.png": "Picture: the last scene of an episode of the expert.",
+    }
+    name = next(name for name in pictures if (FOLDER / "gallery" / name).exists())
+    lines = [f"# {task}", "", f"![{task}](../../gallery/{name})", "", pictures[name], ""]
+    lines += [found.text, ""]
     lines += [
         "An episode succeeds when all conditions of the row `success` hold. The row `expert` has",
         "success rates. Keys and units: [environments](../../environments.md#keys).",
         "",
     ]
     lines += ["| | value (allowed values) |", "|---|---|"]
-    lines += [f"| {name} | {_cell(value)} |" for name, value in found.rows().items()]
+    keywords = {"max_steps", "object_scale_range", "num_objects", *found.parameters}
+    for name, value in found.rows().items():
+        lines.append(f"| {f'`{name}`' if name in keywords else name} | {_cell(value)} |")
     if task in shipped_policies():
         card = read_card(shipped_file(task))
         low, high = card.interval

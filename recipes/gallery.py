@@ -1,7 +1,7 @@
-"""Draw the tasks: an episode of each expert, and one picture of all tasks.
+"""Draw the tasks: a picture and a film of each, and one picture of all.
 
-python recipes/gallery.py                       # pictures in runs/gallery
-python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png overwrite=true
+python recipes/gallery.py                       # in runs/gallery
+python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png films=true overwrite=true
 python recipes/gallery.py 'tasks=[close_loop/block_picking]' folder=pictures overview=null
 """
 
@@ -17,10 +17,9 @@ from PIL import Image, ImageDraw
 from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl import list_tasks, make
+from ba_torchrl import list_tasks, load_policy, make
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
-    Count,
     OutputFolder,
     PluginSettings,
     PngFile,
@@ -31,11 +30,21 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.core import keys
 from ba_torchrl.core.files import replaced
+from ba_torchrl.demonstrations.collect import expert_policy
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs.description import tasks_by_heading
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.video import FrameRecorder
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
+from ba_torchrl.training.evaluation import record_episodes
+from ba_torchrl.training.policy import shipped_policies
 
+STILL = 240
+"""Width of the picture of a task, in pixels."""
+MOST_FRAMES, QUALITY = 40, 50
+"""Of a film, a WebP file."""
+ATTEMPTS = 5
+"""Episodes after which a film shows one that failed."""
 CELL, TITLE, HEADING, SPACE = 194, 36, 60, 18
 """Width of an image, height of a title above images and of a heading above a group of tasks, and
 distance between the images of two tasks, in pixels."""
@@ -56,10 +65,11 @@ class Settings(PluginSettings):
     """Structures whose deconstruction is drawn."""
     seed: Seed = 5
     """Of the episodes."""
-    pictures: Count = 4
-    """Of each episode."""
+    films: bool = False
+    """Also write a film of each task: TASK.webp by the policy that the package ships, or
+    TASK_expert.webp."""
     folder: OutputFolder = "runs/gallery"
-    """Of the pictures."""
+    """Of pictures and films."""
     overview: PngFile | None = "runs/gallery/all_tasks.png"
     """Picture of all tasks, or null."""
     overwrite: bool = False
@@ -76,25 +86,29 @@ class Strip(NamedTuple):
 
 
 def main(settings: Settings) -> None:
-    """Play one episode per task and write its pictures."""
+    """Play one episode per task and write its picture, and its film."""
     folder, strips = Path(settings.folder), {}
     files = {
         task: folder / f"{task.replace('/', '_')}.png" for task in settings.tasks or list_tasks()
     }
+    films = {task: film_path(task, path) for task, path in files.items() if settings.films}
     apart = {
         task: folder / f"{task.replace('/', '_')}_deconstruction.png"
         for task in settings.deconstructions
     }
     if not settings.overwrite:
         overview = [settings.overview] if settings.overview else []
-        check_untracked([*files.values(), *apart.values(), *overview])
+        check_untracked([*files.values(), *films.values(), *apart.values(), *overview])
     for task, path in tqdm(files.items(), unit="task"):
-        strip = strips[task] = expert_strip(task, settings.seed, settings.pictures)
-        tqdm.write(str(write(labelled(task, [strip.first_image, *strip.pictures]), path)))
+        strip = strips[task] = expert_strip(task, settings.seed, pictures=2)
+        still = Image.fromarray(strip.pictures[-1]).resize((STILL, STILL))
+        tqdm.write(str(write(still, path)))
+        if task in films:
+            frames, milliseconds = film_frames(task, settings.seed)
+            tqdm.write(str(write_film(frames, milliseconds, films[task])))
     for task, path in apart.items():
-        strip = expert_strip(task, settings.seed, settings.pictures, deconstruct=True)
-        title = f"{task}, deconstruction"
-        print(write(labelled(title, [strip.first_image, *strip.pictures]), path))
+        strip = expert_strip(task, settings.seed, pictures=2, deconstruct=True)
+        print(write(labelled(f"{task}, deconstruction", strip.pictures), path))
     if settings.overview is not None:
         print(write(overview_of(strips), Path(settings.overview)))
 
@@ -124,6 +138,50 @@ def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool =
         between = [min(recorder.contacts, key=lambda i: abs(i - wanted)) for wanted in between]
     chosen = [*dict.fromkeys([0, *between]), last][:pictures]
     return Strip([recorder.frames[i] for i in chosen], first)
+
+
+def film_path(task: str, picture: Path) -> Path:
+    """Return the file of a task's film, beside its picture."""
+    return picture.with_name(
+        picture.stem + ("" if task in shipped_policies() else "_expert") + ".webp"
+    )
+
+
+def film_frames(task: str, seed: int) -> tuple[list[np.ndarray], float]:
+    """Return the images of a successful episode, and the milliseconds of each.
+
+    It is of the shipped policy, or of the expert where there is none.
+    """
+    if task in shipped_policies():
+        policy = load_policy(task)
+        resolved = policy.config.resolved_env
+    else:
+        policy, resolved = expert_policy, resolve_env(task, {"expert": True})
+    succeeded: list[bool] = []
+    for attempt in range(ATTEMPTS):
+        frames = record_episodes(
+            resolved, policy, 1, seed + attempt, on_episode=lambda *end: succeeded.append(end[-1])
+        )
+        if succeeded[-1]:
+            break
+    return frames, 1000 / resolved.video_fps
+
+
+def write_film(frames: Sequence[np.ndarray], milliseconds: float, path: Path) -> Path:
+    """Write images as a WebP of the same duration with at most `MOST_FRAMES` images."""
+    step = math.ceil(len(frames) / MOST_FRAMES)
+    first, *others = (Image.fromarray(frame) for frame in frames[(len(frames) - 1) % step :: step])
+    with replaced(path) as scratch:
+        first.save(
+            scratch,
+            format="WEBP",
+            save_all=True,
+            append_images=others,
+            duration=round(step * milliseconds),
+            quality=QUALITY,
+            loop=0,
+        )
+    return path
 
 
 def labelled(title: str, images: Sequence[np.ndarray]) -> Image.Image:

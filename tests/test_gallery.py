@@ -3,13 +3,22 @@ import subprocess
 import imageio.v3 as imageio
 import numpy as np
 import pytest
-from PIL import ImageDraw
+from PIL import Image, ImageDraw
 
 from ba_torchrl import make
 from ba_torchrl.commands import tasks
 from ba_torchrl.core import keys
 from ba_torchrl.record.video import FrameRecorder
-from recipes.gallery import COMMAND, Strip, expert_strip, labelled, overview_of, write
+from recipes.gallery import (
+    COMMAND,
+    MOST_FRAMES,
+    Strip,
+    expert_strip,
+    labelled,
+    overview_of,
+    write,
+    write_film,
+)
 
 TASK = "close_loop/block_reaching"
 BLUE = (20, 40, 220)
@@ -77,6 +86,16 @@ def test_a_deconstruction_starts_from_the_goal():
     built = expert_strip(task, seed=0, pictures=2)
     apart = expert_strip(task, seed=0, pictures=2, deconstruct=True)
     assert built.first_image.max() < 0.6 * apart.first_image.max()
+
+
+def test_a_long_film_has_fewer_images_and_ends_with_the_last(tmp_path):
+    frames = [
+        np.full((16, 16, 3), value, np.uint8) for value in [*(37 * i % 256 for i in range(99)), 255]
+    ]
+    with Image.open(write_film(frames, 50, tmp_path / "film.webp")) as film:
+        assert MOST_FRAMES / 2 < film.n_frames <= MOST_FRAMES
+        film.seek(film.n_frames - 1)
+        assert np.asarray(film.convert("RGB")).min() > 245
 
 
 def test_an_overview_has_start_and_goal_of_each_task_under_headings(tmp_path, texts, monkeypatch):

@@ -87,7 +87,7 @@ def plot_panels(
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
     demonstrated = any(each.demonstration_steps for of in panels.values() for each in of.values())
-    xlabel += "; dotted, left of 0: steps of demonstrations" if demonstrated else ""
+    xlabel += "\ndotted, left of 0: steps of demonstrations" if demonstrated else ""
     figure.supxlabel(xlabel, fontsize=10)
     figure.supylabel(ylabel, fontsize=10)
     for path in map(Path, paths):
