@@ -284,8 +284,8 @@ def test_a_damaged_result_concerns_its_run_only(tmp_path, fake):
         (runs[0].folder / "result.json").write_bytes(content)
         assert [status(run).state for run in runs] == ["failed", "done"]
         assert "delete the folder" in status(runs[0]).detail
-        page = write([tmp_path], tmp_path / "report")
-        assert "result.json is damaged" in (page.parent / "table.md").read_text()
+    page = write([tmp_path], tmp_path / "report")
+    assert "result.json is damaged" in (page.parent / "table.md").read_text()
 
 
 def test_a_damaged_record_of_a_failure_concerns_its_run_only(tmp_path, fake):
@@ -294,7 +294,7 @@ def test_a_damaged_record_of_a_failure_concerns_its_run_only(tmp_path, fake):
     for content in (b"", b'{"rea', b"\x80\x04\x95", b"[]", b"{}"):
         (runs[0].folder / "failure.json").write_bytes(content)
         assert str(status(runs[0])) == "failed: failure.json is damaged"
-        write([tmp_path], tmp_path / "report")
+    write([tmp_path], tmp_path / "report")
     assert fake(runs) == {}
 
 
