@@ -32,8 +32,9 @@ SHORTER = {
     "range(10_000, 10_050)": "range(1)",
     "policy, 100, seed=0)": "policy, 5, seed=0)",
     "buffer_size=10_000": "buffer_size=200",
+    '"close_loop/block_picking", 5, seed=0)': '"close_loop/block_picking", 1, start_method="fork")',
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 1,',
-    '"mine/stack_on_plateau", 4)': '"mine/stack_on_plateau", 1)',
+    '"mine/stack_on_plateau", 4)': '"mine/stack_on_plateau", 1, start_method="fork")',
 }
 """Parts of the pages' Python that take minutes or many processes, and what runs instead."""
 
