@@ -20,19 +20,24 @@ from tests.training.test_experiment import tiny
     ],
 )
 def test_a_run_collects_learns_and_evaluates(tmp_path, preset, network, obs_size):
+    algorithm, pretraining = {**method(preset), "batch_size": 4}, {}
+    if network == "ferm":  # pretraining of the encoder alone
+        algorithm["contrastive"] = {**algorithm["contrastive"], "updates": 2}
+        pretraining = {"pretrain_updates": 0}
     config = tiny(
         tmp_path,
-        algorithm={**method(preset), "batch_size": 4},
+        algorithm=algorithm,
         network={"name": network, "width": 0.1},
         env={"obs_size": obs_size, "max_steps": 5},
         total_updates=4,
         eval_every=4,
         video_episodes=0,
+        **pretraining,
     )
     result = Experiment(config, progress=False).run()
     scalars = read_scalars(tmp_path / "run")
     assert result.updates == 4
     assert scalars["eval/success_rate"].steps.tolist() == [0, 4]
-    pretraining = [] if network == "ferm" else [1, 2]  # of the encoder alone
-    assert scalars["train/loss_qvalue"].steps.tolist() == [*pretraining, 3, 4]
+    without = [] if network == "ferm" else [1, 2]
+    assert scalars["train/loss_qvalue"].steps.tolist() == [*without, 3, 4]
     assert ("train/loss_contrastive" in scalars) is (network == "ferm")
