@@ -28,7 +28,7 @@ NEXT = {
         f"{TRAIN} task=close_loop/block_reaching algorithm=mine/{{name}} network=cnn_small "
         "demonstrations_noise=0",
     ),
-    "network": (f"{TRAIN} network=mine/{{name}}",),
+    "network": (f"{TRAIN} network=mine/{{name}} algorithm=bc",),
 }
 """What to type after the test, by kind of module."""
 
