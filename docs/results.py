@@ -106,14 +106,20 @@ def page_with_results(text: str) -> str:
 
 
 def _question(section: Section) -> Iterator[str]:
-    """Yield the lines of the answer to a question."""
+    """Yield the lines of the answer to a question; differences are those to each task's best."""
     yield f"![Success over environment steps](results/{section.title}.svg)\n"
     rows = (_compared_cells(group, section.end(group.task)) for group in section.groups)
     yield from pipes(COMPARED, *rows)
     yield ""
-    yield from pipes(DIFFERENCES, *map(_difference, compare(section)))
+    best = {group.task: group for group in sorted(section.groups, key=lambda group: group.success)}
+    rows = (row for row in compare(section) if _has(row, best[str(row["task"])].method))
+    yield from pipes(DIFFERENCES, *map(_difference, rows))
     yield ""
     yield _origin([run for group in section.groups for run in group.runs])
+
+
+def _has(row: Mapping[str, object], method: str) -> bool:
+    return method in (row["first"], row["second"])
 
 
 def _compared_cells(group: Group, end: int) -> list[str]:
