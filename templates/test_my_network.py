@@ -1,4 +1,4 @@
-"""The network takes any batch shape, sees where things are, and trains."""
+"""The network takes any batch shape, and trains."""
 
 import pytest
 import torch

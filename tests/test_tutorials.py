@@ -64,6 +64,8 @@ def test_what_the_command_writes_passes_its_own_test(kind, tmp_path, monkeypatch
         (["task", "mine"], "mine.py exists already"),
         (["task", "json"], "another module has the name 'json'"),
         (["task", "a-b"], "'a-b' is no name of a module"),
+        (["task", "_1"], "'_1' gives no name to its class"),
+        (["task", "box"], "imports another Box"),
         (["tasks", "a"], "kind: Input should be 'task', 'algorithm' or 'network'"),
         (["task"], "name is missing"),
         (["task", "a", "b"], "'b' sets nothing"),

@@ -157,11 +157,10 @@ class Learner(ABC):
         return []
 
     def due_stages(self) -> Sequence[LossFunction]:
-        """Return the losses of the update that follows `updates` others; by default those of
-        `make_pretraining` if any are due, or all stages. An algorithm that updates its policy less
-        often than its critics leaves one out."""
-        first = [loss for updates, loss in self.pretraining if self.updates < updates]
-        return first or self.stages
+        """Return the stages of the update that follows `updates` others, unless a loss of
+        `make_pretraining` is due; by default all. An algorithm that updates its policy less often
+        than its critics leaves one out."""
+        return self.stages
 
     def make_target_updater(self) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
@@ -265,7 +264,8 @@ class Learner(ABC):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        scalars = self.minimize(batch, self.due_stages())
+        first = [loss for updates, loss in self.pretraining if self.updates < updates]
+        scalars = self.minimize(batch, first or self.due_stages())
         if self._is_prioritized and keys.TD_ERROR in batch:
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
             self.host_tasks.submit(errors, self._set_priorities)

@@ -11,7 +11,8 @@ import torch
 
 from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.modules.base import Control
+from ba_torchrl.modules.base import Control, NetworkConfig
+from ba_torchrl.modules.layers import compute_dtype
 
 
 class SeedUse(IntEnum):
@@ -65,3 +66,9 @@ class Problem:
     def derived_seed(self, use: SeedUse) -> int:
         """Return the run's seed for one use of randomness."""
         return derive_seed(self.seed, use)
+
+
+def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
+    """Return the number format of a network's convolutions on a device; float32 for a network
+    without the field ``precision``."""
+    return compute_dtype(getattr(network, "precision", "float32"), device)

@@ -123,7 +123,7 @@ class SAC(Learner):
 
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and critic."""
-        if self.config.contrastive.name != "none" and not getattr(network, "shares_encoder", True):
+        if self.config.contrastive.name != "none" and not getattr(network, "shares_encoder", False):
             name = NETWORKS.name_of(type(network))
             logger.warning("contrastive has no effect on the encoder of the policy of %r", name)
         networks = network.build(self.network_spec)

@@ -8,6 +8,7 @@ ba-torchrl new network my_network
 from __future__ import annotations
 
 import keyword
+import re
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
@@ -37,11 +38,18 @@ def check_module(name: str) -> None:
     """Check that a new module of this folder can have a name."""
     if not name.isidentifier() or keyword.iskeyword(name) or name != name.lower():
         raise ConfigError(f"{name!r} is no name of a module: lower-case letters, digits and _")
+    if not class_name(name).isidentifier() or keyword.iskeyword(class_name(name)):
+        raise ConfigError(f"{name!r} gives no name to its class; begin with a letter, as my_task")
     for path in files(name):
         check_new(path)
         check_writable_file(path)
     if find_spec(name) is not None:
         raise ConfigError(f"another module has the name {name!r}; choose another one")
+
+
+def class_name(name: str) -> str:
+    """Return the name of a module's class."""
+    return "".join(map(str.capitalize, name.split("_")))
 
 
 def files(name: str) -> list[str]:
@@ -61,9 +69,11 @@ class Settings(StrictModel):
 def main(settings: Settings) -> None:
     """Write the files."""
     kind, name = settings.kind, settings.name
-    old, camel = f"my_{kind}", "".join(map(str.capitalize, name.split("_")))
-    for path, template in zip(files(name), files(old), strict=True):
-        text = (data_dir("templates") / template).read_text(encoding="utf-8")
+    old, camel = f"my_{kind}", class_name(name)
+    templates = [(data_dir("templates") / file).read_text(encoding="utf-8") for file in files(old)]
+    if any(re.search(rf"\b{camel}\b", text) for text in templates):
+        raise ConfigError(f"the module imports another {camel}; choose another name, as my_{name}")
+    for path, text in zip(files(name), templates, strict=True):
         text = text.replace(old, name).replace(f"My{kind.capitalize()}", camel)
         Path(path).write_text(text, encoding="utf-8")
     print(f"{' and '.join(files(name))} are written. Next:")

@@ -152,7 +152,9 @@ def plot_groups(
     axis: Axis = "env_steps",
     methods: Sequence[str] | None = None,
 ) -> None:
-    """Plot the curves of every method with their intervals and seeds, a panel for each task.
+    """Plot the curves of every method with its seeds, a panel for each task.
+
+    One seed and five or more have a band, the interval.
 
     Over environment steps, dotted lines from the left to 0 are steps of demonstrations.
 
@@ -171,6 +173,8 @@ def plot_groups(
             ([getattr(point, axis) for point in points], [point.success_rate for point in points])
             for points in (run.result.curve for run in group.runs)
         ]
+        if 1 < len(runs) < ENOUGH_SEEDS:  # which are all drawn
+            curve = curve[:1]
         demonstrations = [run.result.demonstration_steps or 0 for run in group.runs]
         panels[group.task][group.method] = Learning(
             (x, *curve),

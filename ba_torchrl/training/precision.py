@@ -4,16 +4,9 @@ from __future__ import annotations
 
 import torch
 
+from ba_torchrl.algorithms.problem import network_dtype
 from ba_torchrl.core.hardware import processor
-from ba_torchrl.modules.base import NetworkConfig
-from ba_torchrl.modules.layers import compute_dtype
 from ba_torchrl.training.config import ExperimentConfig
-
-
-def network_dtype(network: NetworkConfig, device: torch.device) -> torch.dtype:
-    """Return the number format of a network's convolutions on a device; float32 for a network
-    without the field ``precision``."""
-    return compute_dtype(getattr(network, "precision", "float32"), device)
 
 
 def precision(config: ExperimentConfig) -> str:

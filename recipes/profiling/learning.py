@@ -16,6 +16,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
+from ba_torchrl.algorithms.problem import network_dtype
 from ba_torchrl.core import keys
 from ba_torchrl.core.hardware import amx_is_used
 from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCodec
@@ -25,7 +26,6 @@ from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on
-from ba_torchrl.training.precision import network_dtype
 from profiling.limits import MatrixProduct, count_multiply_adds
 from profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 

@@ -1,1 +1,1 @@
-"""Layers on escnn's bases of steerable kernels, and the CPU kernels behind them."""
+"""Layers on bases of steerable kernels, and the CPU kernels behind them."""

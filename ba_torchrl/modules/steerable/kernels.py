@@ -1,4 +1,4 @@
-"""escnn's bases of steerable kernels, and the scales of their initial coefficients."""
+"""Bases of steerable kernels, of escnn or `planar`, and scales of their initial coefficients."""
 
 from __future__ import annotations
 
