@@ -6,6 +6,7 @@ import importlib
 import re
 import shlex
 import shutil
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -106,27 +107,33 @@ def test_brackets_in_a_command_of_a_help_or_a_configuration_are_quoted(capsys):
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory):
-    """Return a folder with two episodes, as the page's `ba-torchrl collect` writes it."""
-    folder = tmp_path_factory.mktemp("demos") / "picking"
-    page = ROOT / "docs" / "tutorials" / "cloning.md"
-    (line,) = (line for _, line in command_lines([page]) if f" path={DEMONSTRATIONS}" in line)
-    words = line.replace(DEMONSTRATIONS, str(folder)).replace("=100", "=2").split()[2:]
-    words += ["num_envs=1", "parallel=false"]
-    importlib.import_module("ba_torchrl.commands.collect").COMMAND.run(words)
-    return folder
+    """Return a function from a page to a folder with two episodes, as its `ba-torchrl collect`
+    writes it."""
+
+    @cache
+    def collected(page):
+        folder = tmp_path_factory.mktemp("demos") / "picking"
+        (line,) = (line for _, line in command_lines([page]) if f" path={DEMONSTRATIONS}" in line)
+        words = line.replace(DEMONSTRATIONS, str(folder)).replace("=100", "=2").split()[2:]
+        words += ["num_envs=1", "parallel=false"]
+        importlib.import_module("ba_torchrl.commands.collect").COMMAND.run(words)
+        return folder
+
+    return collected
 
 
 @pytest.mark.parametrize(
-    ("script", "modules"), [s[1:] for s in scripts()], ids=[s[0] for s in scripts()]
+    ("name", "script", "modules"), scripts(), ids=[name for name, _, _ in scripts()]
 )
-def test_python_of_a_page_runs(script, modules, tmp_path, request):
+def test_python_of_a_page_runs(name, script, modules, tmp_path, demonstrations):
     for long, short in SHORTER.items():
         script = script.replace(long, short)
     (tmp_path / "my_tasks.py").write_text(modules)
     for path in TEMPLATES.glob("my_*.py"):
         shutil.copy(path, tmp_path)
     if DEMONSTRATIONS in script:
-        shutil.copytree(request.getfixturevalue("demonstrations"), tmp_path / DEMONSTRATIONS)
+        (page,) = (page for page in PAGES if page.name == name.split()[0])
+        shutil.copytree(demonstrations(page), tmp_path / DEMONSTRATIONS)
     run_script(tmp_path, script)
 
 
