@@ -252,7 +252,7 @@ def test_doctor_names_the_command_that_mends(capsys, monkeypatch):
     assert end.value.code == 1
     assert "no-such-package        missing\n" in out
     assert "pip install no-such-package" in out
-    assert "trained policies       close_loop/block_in_bowl, close_loop/block_picking" in out
+    assert "trained policies       bump/house_building_4, close_loop/block_in_bowl" in out
 
 
 def test_doctor_goes_on_without_torch(capsys, monkeypatch):
