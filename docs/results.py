@@ -15,11 +15,10 @@ import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
-from matplotlib import rc_context
 from matplotlib.figure import Figure
 
 from ba_torchrl.commands.report import completed
-from ba_torchrl.core.files import replaced, write_text
+from ba_torchrl.core.files import write_text
 from ba_torchrl.envs.description import describe, tasks_by_heading
 from ba_torchrl.record.leaderboard import (
     LEGEND,
@@ -30,6 +29,7 @@ from ba_torchrl.record.leaderboard import (
     package_runs,
     read_records,
 )
+from ba_torchrl.record.plots import save
 from ba_torchrl.record.report import plot_groups
 from ba_torchrl.record.summary import (
     GOOD_RATE,
@@ -179,8 +179,7 @@ def plot_tasks(board: Leaderboard, path: Path) -> None:
             else:
                 axes.text(0.01, y, "no policy", fontsize=6, color="0.4", va="center")
     panels[-1, 0].set_xlabel("success: policy (dot, 95 % interval), expert (bar)", fontsize=8)
-    with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
-        figure.savefig(scratch, metadata={"Date": None})
+    save(figure, path)
 
 
 def _rows(board: Leaderboard, task: str) -> Iterator[list[str]]:

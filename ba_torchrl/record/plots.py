@@ -91,10 +91,14 @@ def plot_panels(
     figure.supxlabel(xlabel, fontsize=10)
     figure.supylabel(ylabel, fontsize=10)
     for path in map(Path, paths):
-        metadata = {"Date": None} if path.suffix == ".svg" else None
-        # the same file for the same curves
-        with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
-            figure.savefig(scratch, metadata=metadata)
+        save(figure, path)
+
+
+def save(figure: Figure, path: Path) -> None:
+    """Write a figure, to the same file for the same content."""
+    metadata = {"Date": None} if path.suffix == ".svg" else None
+    with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
+        figure.savefig(scratch, metadata=metadata)
 
 
 def _draw(axes: Axes, number: int, method: Learning) -> Line2D:

@@ -38,3 +38,11 @@ def test_a_learner_leaves_out_the_stage_of_its_policy(monkeypatch):
         after = {name: flat(part.values(True, True)) for name, part in parts.items()}
         changed.append({name for name in parts if not torch.equal(before[name], after[name])})
     assert changed == 2 * [{"critic"}, {"critic"}, {"actor", "critic", "target"}]
+
+
+def test_first_updates_are_those_of_pretraining_whatever_stages_are_due(monkeypatch):
+    learner = tiny.build("sac", init={"name": "bc", "updates": 1})
+    monkeypatch.setattr(type(learner), "due_stages", lambda self: self.stages)
+    learner.extend(tiny.transitions(learner))
+    assert "loss_qvalue" not in learner.update()
+    assert "loss_qvalue" in learner.update()

@@ -499,6 +499,8 @@ def test_few_seeds_are_a_warning(tmp_path, seeds):
     for name in ("report.html", "table.md", "table.tex"):
         text = (path.parent / name).read_text()
         assert ("Fewer than 5 seeds: direction only" in text) is (seeds < 5)
+    figure = next((tmp_path / "report").glob("*.svg")).read_text()
+    assert ("FillBetween" in figure) is (seeds != 4)  # the band of an interval
 
 
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="Chromium is not installed")

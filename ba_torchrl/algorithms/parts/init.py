@@ -48,7 +48,7 @@ class ExploringCloning(Cloning):
     """Behaviour cloning of a policy that explores afterwards."""
 
     entropy_weight: float = Field(default=0.01, ge=0)
-    """Weight of the policy's negative entropy; that of SAC's initial temperature."""
+    """Weight of the policy's negative entropy, by default the default of SAC's `alpha_init`."""
 
 
 Init = Annotated[RandomInit | Cloning, Field(discriminator="name")]
