@@ -155,18 +155,21 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
 
 
 def plot_tasks(board: Leaderboard, path: Path) -> None:
-    """Plot the success of each task's best method with its interval beside that of the expert."""
-    figure = Figure(figsize=(6.4, 0.21 * len(board.tasks) + 0.9), layout="constrained")
+    """Plot the success of each task's best method with its interval beside that of the expert.
+
+    Text is readable on a telephone, 360 px wide.
+    """
+    figure = Figure(figsize=(4.4, 0.21 * len(board.tasks) + 1.2), layout="constrained")
     headings = tasks_by_heading(board.tasks)
     heights = [len(tasks) for tasks in headings.values()]
     panels = figure.subplots(len(headings), 1, sharex=True, squeeze=False, height_ratios=heights)
     for axes, (heading, tasks) in zip(panels[:, 0], headings.items(), strict=True):
-        axes.set_title(heading, fontsize=8, loc="left")
-        axes.set_yticks(range(len(tasks)), tasks, fontsize=7)
+        axes.set_title(heading, fontsize=9, loc="right")  # longer than the panel is wide
+        axes.set_yticks(range(len(tasks)), tasks, fontsize=8)
         axes.set_ylim(len(tasks) - 0.5, -0.5)
         axes.set_xlim(0, 1.02)
         axes.grid(axis="x", color="0.9")
-        axes.tick_params(axis="x", labelsize=7)
+        axes.tick_params(axis="x", labelsize=8)
         for y, task in enumerate(tasks):
             score = describe(task).experts.get("kuka")
             if score:
@@ -177,8 +180,8 @@ def plot_tasks(board: Leaderboard, path: Path) -> None:
                 axes.plot([low, high], [y, y], color="#0072B2", linewidth=1.5)
                 axes.plot(rate, y, "o", color="#0072B2", markersize=4)
             else:
-                axes.text(0.01, y, "no policy", fontsize=6, color="0.4", va="center")
-    panels[-1, 0].set_xlabel("success: policy (dot, 95 % interval), expert (bar)", fontsize=8)
+                axes.text(0.01, y, "no policy", fontsize=8, color="0.4", va="center")
+    figure.supxlabel("success: policy (dot, 95 % interval), expert (bar)", fontsize=9)
     save(figure, path)
 
 
@@ -221,7 +224,7 @@ def main() -> None:
     if sys.argv[1:]:
         print(f"{add(sys.argv[1:])} records added")
     for name, section in questions().items():
-        plot_groups(section.groups, [FOLDER / f"{name}.svg"])
+        plot_groups(section.groups, [FOLDER / f"{name}.svg"], columns=1)
     plot_tasks(present(), FOLDER / "tasks.svg")
     PAGE.write_text(page_with_results(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 

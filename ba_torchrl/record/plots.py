@@ -46,6 +46,7 @@ def plot_panels(
     xlabel: str = "updates",
     ylabel: str = "success rate",
     panel_in: tuple[float, float] = (2.5, 1.8),
+    columns: int = 4,
 ) -> None:
     """Plot rates into a grid of panels, as in the paper's figures 18 to 22.
 
@@ -57,8 +58,9 @@ def plot_panels(
         names: names of all curves, in the order of colours and markers; a name has the same ones in
             all panels.
         panel_in: width and least height of a panel.
+        columns: most panels in a row; of four, three where they leave fewer places empty.
     """
-    columns = min(min((4, 3), key=lambda n: -len(panels) % n), len(panels))
+    columns = min(columns, min((4, 3), key=lambda n: -len(panels) % n), len(panels))
     rows = math.ceil(len(panels) / columns)
     labels = {name: textwrap.wrap(name, _LABEL_WIDTH) for name in names}
     gap_in = 1.3 * _LABEL_PT / 72 * max(map(len, labels.values()), default=1)

@@ -151,6 +151,7 @@ def plot_groups(
     paths: Sequence[Path],
     axis: Axis = "env_steps",
     methods: Sequence[str] | None = None,
+    columns: int = 4,
 ) -> None:
     """Plot the curves of every method with its seeds, a panel for each task.
 
@@ -163,6 +164,7 @@ def plot_groups(
         paths: of the figure in several formats.
         axis: of the curves.
         methods: in the order of colours; those of the groups if None.
+        columns: most panels in a row.
     """
     panels: dict[str, dict[str, Learning]] = {group.task: {} for group in groups}
     for group in groups:
@@ -183,7 +185,7 @@ def plot_groups(
         )
     names = methods or sorted({group.method for group in groups})
     xlabel = {"env_steps": "environment steps", "updates": "updates"}[axis]
-    plot_panels(panels, paths, names=names, xlabel=xlabel)
+    plot_panels(panels, paths, names=names, xlabel=xlabel, columns=columns)
 
 
 def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:

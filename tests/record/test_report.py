@@ -571,6 +571,10 @@ def test_panels_share_colours_and_keep_their_names(tmp_path):
     again = tmp_path / "again"
     plot_panels(curves, [again / "p.svg"], names=["first", "second"])
     assert (again / "p.svg").read_bytes() == path.read_bytes()
+    plot_panels(curves, [path], names=["first", "second"], columns=1)
+    above, below = lines(path)[ORANGE]
+    assert above[0, 0] == pytest.approx(below[0, 0])
+    assert above[:, 1].max() < below[:, 1].min()
     with pytest.raises(ValueError, match="third"):
         plot_panels({"a": {"third": Learning((x, x))}}, [path], names=["first"])
 
