@@ -8,7 +8,8 @@ from ba_torchrl.core.lazy import lazy_names
 from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
-    from ba_torchrl.core.config import EnvConfig, WorkerOptions
+    from ba_torchrl.core.config import WorkerOptions
+    from ba_torchrl.core.env_config import EnvConfig
     from ba_torchrl.envs.base import BulletArmEnv
     from ba_torchrl.envs.description import describe
     from ba_torchrl.envs.factory import make, make_vector_env
@@ -19,7 +20,7 @@ __version__ = "0.1.0"
 
 _MODULES = {
     "BulletArmEnv": "envs.base",
-    "EnvConfig": "core.config",
+    "EnvConfig": "core.env_config",
     "ResolvedEnv": "envs.settings",
     "WorkerOptions": "core.config",
     "describe": "envs.description",

@@ -19,7 +19,7 @@ from sphinx.util import logging
 
 from ba_torchrl import __version__, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.envs.description import describe, expert_scores, summary, tasks_by_heading
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.training.config import ExperimentConfig

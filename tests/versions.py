@@ -228,8 +228,8 @@ def check_update(values: dict[str, object]) -> None:
     """Take an update on two demonstrations."""
     from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.envs.factory import make_vector_env
-    from ba_torchrl.training.checkpoint import build_algorithm
     from ba_torchrl.training.config import ExperimentConfig
+    from ba_torchrl.training.learner import build_algorithm
 
     config = ExperimentConfig.parse(values)
     algorithm = build_algorithm(config)

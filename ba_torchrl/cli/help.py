@@ -15,7 +15,8 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
-from ba_torchrl.core.config import EnvConfig, env_config_model, parts_of
+from ba_torchrl.core.config import parts_of
+from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.demonstrations.formats.base import FORMATS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.camera_views import VIEWS

@@ -125,7 +125,7 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
     """Return the updates of a learner per second, with a replay of a few demonstrations."""
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import collect_demonstrations
-    from ba_torchrl.training.checkpoint import build_algorithm
+    from ba_torchrl.training.learner import build_algorithm
 
     algorithm = build_algorithm(config)
     env = make_vector_env(config.resolved_env, 1, parallel=False, seed=settings.seed, expert=True)

@@ -69,7 +69,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     Args:
         task: one of `available_envs`, or what `resolve_env` returned.
         device: of its TensorDicts, the CPU by default. The simulation is on the CPU.
-        config: fields of `ba_torchrl.core.config.EnvConfig`, such as ``robot="kuka"``,
+        config: fields of `ba_torchrl.core.env_config.EnvConfig`, such as ``robot="kuka"``,
             ``seed=0`` or ``expert=True``.
 
     Raises:

@@ -10,7 +10,7 @@ from torchrl.data import Bounded
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import CloseLoopActions
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.images import Frame, ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.episode_positions import RecordedPosition

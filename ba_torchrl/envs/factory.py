@@ -23,8 +23,8 @@ def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv:
     Args:
         task: an id such as "close_loop/block_picking", see `ba_torchrl.list_tasks`; or what
             `resolve_env` returned.
-        config: fields of `ba_torchrl.core.config.EnvConfig` and of the task's own parameters, such
-            as ``robot="kuka"``, ``seed=0``, ``obs_size=64`` or ``expert=True``; and ``device``.
+        config: fields of `ba_torchrl.core.env_config.EnvConfig` and of the task's own parameters,
+            such as ``robot="kuka"``, ``obs_size=64``, ``seed=0`` or ``expert=True``; and ``device``
 
     Raises:
         ConfigError: as for `BulletArmEnv`.

@@ -44,7 +44,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         task: as listed by `ba_torchrl.list_tasks`.
         render_mode: ``rgb_array`` for images from `render`, ``human`` for PyBullet's window.
         register_modules: names of modules outside the package that register the task or its robot.
-        config: fields of `ba_torchrl.core.config.EnvConfig`.
+        config: fields of `ba_torchrl.core.env_config.EnvConfig`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {"render_modes": ["human", "rgb_array"], "render_fps": 5}

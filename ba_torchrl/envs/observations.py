@@ -16,7 +16,7 @@ from torch import Tensor
 from torchrl.data import Bounded, NonTensor, TensorSpec, Unbounded
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry

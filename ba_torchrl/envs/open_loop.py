@@ -13,7 +13,7 @@ from torchrl.data import Bounded
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from ba_torchrl.core.config import CUSTOM_PHYSICS, EnvConfig
+from ba_torchrl.core.env_config import CUSTOM_PHYSICS, EnvConfig
 from ba_torchrl.core.errors import ConfigError, SimulationError
 from ba_torchrl.sim.geometry import downward
 from ba_torchrl.sim.robots.base import ROBOTS, Robot

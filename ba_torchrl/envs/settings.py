@@ -8,7 +8,8 @@ from functools import cached_property
 from typing import Any, ClassVar, Protocol
 
 from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
-from ba_torchrl.core.config import EnvConfig, env_config_model, parse
+from ba_torchrl.core.config import parse
+from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import MAIN, check_spawned_process_knows, import_modules
 from ba_torchrl.core.registry import Registry

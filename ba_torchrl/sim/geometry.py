@@ -191,6 +191,11 @@ def downward_pose(position: Vector, yaw_rad: float) -> Pose:
     return Pose(position, downward_quaternion(yaw_rad))
 
 
+def carrying_pose(tool: Pose, held: Pose, target: Pose) -> Pose:
+    """Return the pose of the tool that brings the held body to a pose."""
+    return target.compose(held.inverse().compose(tool))
+
+
 def bullet_compose(outer: Pose, inner: Pose) -> Pose:
     """Return `outer.compose(inner)`, computed by PyBullet in single precision."""
     return Pose(*pybullet.multiplyTransforms(*outer, *inner))

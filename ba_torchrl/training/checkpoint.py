@@ -32,7 +32,7 @@ from torchrl.checkpoint import (
 )
 
 from ba_torchrl import __version__
-from ba_torchrl.algorithms.base import Learner, Problem
+from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.config import Which
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError
 from ba_torchrl.core.files import (
@@ -48,10 +48,10 @@ from ba_torchrl.core.files import (
     write_text,
 )
 from ba_torchrl.core.plugins import check_known
-from ba_torchrl.envs.factory import make
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, differences
 from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.learner import build_algorithm
 from ba_torchrl.training.state import RunState
 
 logger = logging.getLogger(__name__)
@@ -437,46 +437,6 @@ def load(
     algorithm = build_algorithm(config)
     DurableCheckpoint(algorithm=algorithm).load(checkpoint)
     return config, algorithm
-
-
-def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) -> Learner:
-    """Build the untrained algorithm of an experiment.
-
-    Args:
-        config: of the experiment.
-        problem: what `problem_of` returns for it, if that is known.
-
-    Raises:
-        ConfigError: task, algorithm and network do not go together.
-    """
-    problem = problem or problem_of(config)
-    torch.manual_seed(config.seed)
-    try:
-        return config.algorithm_config.build(config.network_config, problem)
-    except ConfigError:
-        raise
-    except ValueError as error:  # sizes and components that a network does not take
-        raise ConfigError(str(error)) from error
-
-
-def problem_of(config: ExperimentConfig) -> Problem:
-    """Return what the algorithm of an experiment must know of its environment.
-
-    Raises:
-        ConfigError: the environment cannot be made.
-    """
-    env = make(config.resolved_env)
-    env.close()
-    return Problem(
-        control=config.resolved_env.task_class.control,
-        images=env.images,
-        vectors=env.vectors,
-        center_m=config.resolved_env.workspace.center,
-        actions=env.actions,
-        total_updates=config.total_updates,
-        seed=config.seed,
-        device=config.torch_device,
-    )
 
 
 # -- the state to resume from ------------------------------------------------------------------

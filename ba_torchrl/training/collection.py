@@ -19,9 +19,9 @@ from ba_torchrl.demonstrations.collect import collect_demonstrations, source_con
 from ba_torchrl.demonstrations.demo_files import load_demonstrations
 from ba_torchrl.demonstrations.episodes import is_success
 from ba_torchrl.envs.episode_positions import EpisodePosition
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.learner import build_algorithm
 
 logger = logging.getLogger(__name__)
 

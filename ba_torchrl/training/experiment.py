@@ -22,7 +22,6 @@ from ba_torchrl.record.results import CurvePoint, TestedPolicy
 from ba_torchrl.training.checkpoint import (
     Checkpoints,
     ResumeState,
-    build_algorithm,
     lock_run,
     open_run_folder,
     resumable_updates,
@@ -32,6 +31,7 @@ from ba_torchrl.training.collectors.base import Collection
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
+from ba_torchrl.training.learner import build_algorithm
 from ba_torchrl.training.outputs import (
     Result,
     check_packages,
@@ -46,9 +46,8 @@ from ba_torchrl.training.state import RunState
 
 logger = logging.getLogger(__name__)
 
-WARM_UP_UPDATES = 5
-"""First updates, which are slower than later ones and not measured."""
-MEASURED_UPDATES = 15
+WARM_UP_UPDATES, MEASURED_UPDATES = 5, 15
+"""First updates of a phase, which are slower than later ones, and those whose time is measured."""
 
 
 class Experiment:
@@ -84,8 +83,7 @@ class Experiment:
         self._eval_env: EnvBase | None = None
         self.state = RunState()
         self._resume_state = ResumeState(config.folder, self.algorithm, self.state)
-        self._update_times: list[float] = []
-        """Seconds of collection and updates after each of the first updates of a phase."""
+        self._phase_start, self._measured_from_s = 0, 0.0
         self._phase_name = ""
         self._signals = StopSignals()
         self._can_save = False
@@ -180,6 +178,7 @@ class Experiment:
         first = config.algorithm_config.pretraining_updates
         collects = config.algorithm_config.collects
         offline = first + config.pretrain_updates if collects else config.total_updates
+        self._phase_start = algorithm.updates
         with self._phase("pretraining"):
             while algorithm.updates < offline and not self._is_complete:
                 self._update()
@@ -187,7 +186,7 @@ class Experiment:
             return
         with self.state.timed("collection"):
             self._collection = self._start_collection()
-        self._update_times.clear()  # collection between updates takes time
+        self._phase_start = algorithm.updates
         with self._phase("training"):
             while not self._take_pending_updates():
                 with self.state.timed("collection"):
@@ -310,34 +309,22 @@ class Experiment:
             values["train/success_rate"] = sum(state.recent) / len(state.recent)
         self.log.write(self.algorithm.updates, values)
 
-    @property
-    def _seconds_per_update(self) -> float | None:
-        """Mean over the first updates of a phase, without the very first; None until then."""
-        times = self._update_times
-        if len(times) < WARM_UP_UPDATES + MEASURED_UPDATES:
-            return None
-        return (times[-1] - times[WARM_UP_UPDATES - 1]) / MEASURED_UPDATES
-
     def _log_duration(self) -> None:
         """Log the expected duration of the remaining updates after the first ones of a phase."""
-        times, seconds = self._update_times, self.state.phase_seconds
-        if len(times) == WARM_UP_UPDATES + MEASURED_UPDATES:
-            return
-        times.append(seconds["updates"] + seconds["collection"])
-        if len(times) < WARM_UP_UPDATES + MEASURED_UPDATES:
-            return
-        seconds_per_update = self._seconds_per_update
-        target = self.config.stop_at_success
-        remaining = self.config.total_updates - self.algorithm.updates
-        logger.info(
-            "%s: %.2f s an update%s, %.0f minutes for the remaining %d without evaluations%s",
-            compute_path(self.config),
-            seconds_per_update,
-            "" if self._collection is None else " with collection",
-            remaining * seconds_per_update / 60,
-            remaining,
-            "" if target is None else f"; ends once two in a row have a success of {target:g}",
-        )
+        seconds = self.state.phase_seconds["updates"] + self.state.phase_seconds["collection"]
+        taken = self.algorithm.updates - self._phase_start
+        if taken == WARM_UP_UPDATES:
+            self._measured_from_s = seconds
+        if taken == WARM_UP_UPDATES + MEASURED_UPDATES:
+            per_update = (seconds - self._measured_from_s) / MEASURED_UPDATES
+            remaining = self.config.total_updates - self.algorithm.updates
+            logger.info(
+                "%s: %.2f s an update, at most %.0f minutes for the other %d without evaluations",
+                compute_path(self.config),
+                per_update,
+                remaining * per_update / 60,
+                remaining,
+            )
 
     def _evaluate_if_due(self) -> None:
         """Evaluate at 0 and every multiple of ``eval_every``, except at the end of the run."""
@@ -345,19 +332,6 @@ class Experiment:
         is_new = not curve or updates > curve[-1].updates
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
             self._evaluate_and_save()
-            self._log_end()
-
-    def _log_end(self) -> None:
-        """Log the expected duration of the rest of the run after two evaluations in training."""
-        config, updates, state = self.config, self.algorithm.updates, self.state
-        if self._seconds_per_update is None or len(state.curve) > 3:
-            return
-        seconds_per_evaluation = state.phase_seconds["evaluation"] / len(state.curve)
-        remaining = config.total_updates - updates
-        last = 2 * config.final_eval_episodes / config.eval_episodes
-        evaluations = remaining // config.eval_every + last
-        seconds = remaining * self._seconds_per_update + evaluations * seconds_per_evaluation
-        logger.info("about %.0f minutes to the end, evaluations included", seconds / 60)
 
     def _stop_or_save(self) -> None:
         """Stop after a signal; save the state if the last save was long ago."""

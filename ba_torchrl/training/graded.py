@@ -34,9 +34,9 @@ from ba_torchrl.demonstrations.episodes import Policy, collect_episodes, quotas
 from ba_torchrl.envs.factory import make_vector_env
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import versions_of
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on, evaluate
+from ba_torchrl.training.learner import build_algorithm
 
 logger = logging.getLogger(__name__)
 

@@ -22,7 +22,8 @@ from hydra.errors import OverrideParseException
 from omegaconf import OmegaConf
 from pydantic import BaseModel
 
-from ba_torchrl.core.config import EnvConfig, Part
+from ba_torchrl.core.config import Part
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.core.registry import Registry

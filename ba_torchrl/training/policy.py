@@ -44,15 +44,9 @@ from ba_torchrl.record.results import (
 )
 from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
-from ba_torchrl.training.checkpoint import (
-    Which,
-    build_algorithm,
-    find_checkpoint,
-    load,
-    parse_saved,
-    read_versions,
-)
+from ba_torchrl.training.checkpoint import Which, find_checkpoint, load, parse_saved, read_versions
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
+from ba_torchrl.training.learner import build_algorithm
 from ba_torchrl.training.precision import precision
 from ba_torchrl.training.protocol import PROTOCOL, count_parameters
 
@@ -185,7 +179,7 @@ class TrainedPolicy(TensorDictModuleBase):
         """Make the environment that the policy was trained in.
 
         Args:
-            changes: fields of `ba_torchrl.core.config.EnvConfig` with other values, such as
+            changes: fields of `ba_torchrl.core.env_config.EnvConfig` with other values, such as
                 ``seed=0``.
 
         Raises:

@@ -23,9 +23,9 @@ from ba_torchrl.data.replay.codecs import DepthQuantizer, HalfPrecision, ImageCo
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on
+from ba_torchrl.training.learner import build_algorithm
 from profiling.limits import MatrixProduct, count_multiply_adds
 from profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 

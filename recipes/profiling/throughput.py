@@ -16,9 +16,9 @@ from torchrl.collectors import Collector
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.vector.make import make_vector
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.learner import build_algorithm
 from profiling.simulation import SEED, SimulationUnit
 from profiling.table import Bench, Row, measurement
 

@@ -5,7 +5,8 @@ import pytest
 from omegaconf import OmegaConf
 
 import ba_torchrl
-from ba_torchrl.core.config import EnvConfig, TaskParameters, env_config_model, parse
+from ba_torchrl.core.config import TaskParameters, parse
+from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.envs.settings import resolve_env

@@ -10,7 +10,7 @@ import torch
 
 import ba_torchrl
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import CUSTOM_PHYSICS
+from ba_torchrl.core.env_config import CUSTOM_PHYSICS
 from ba_torchrl.envs.observations import vector_names
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.sim.vision.camera_views import VIEWS

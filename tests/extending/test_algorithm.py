@@ -6,9 +6,10 @@ import torch
 from ba_torchrl.core import keys
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.training.checkpoint import load, problem_of
+from ba_torchrl.training.checkpoint import load
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.learner import problem_of
 
 RUN = {
     "task": "close_loop/block_reaching",

@@ -21,9 +21,9 @@ from ba_torchrl.sim.geometry import downward
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
 from ba_torchrl.testing.episodes import play_expert
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.learner import build_algorithm
 from tests.tasks.episodes import slow
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 import ba_torchrl
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import ConfigError, InvalidActionError
 from ba_torchrl.envs.checks import check_actions, checked_action
 from ba_torchrl.envs.settings import resolve_env

@@ -16,8 +16,9 @@ from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
-from ba_torchrl.training.checkpoint import Checkpoints, build_algorithm, load, write_config
+from ba_torchrl.training.checkpoint import Checkpoints, load, write_config
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.learner import build_algorithm
 from recipes.soak import TABLE_FILE, SoakJob, run_soak
 from tests.fuzz.values import JSON, check, examples
 

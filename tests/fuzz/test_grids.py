@@ -4,7 +4,7 @@ import pytest
 from hypothesis import strategies as st
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.core.config import EnvConfig
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import BenchmarkConfig

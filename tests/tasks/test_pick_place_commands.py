@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ba_torchrl.core.actions import PICK, PLACE, OpenLoopActions
-from ba_torchrl.sim.geometry import Pose, downward_pose
+from ba_torchrl.sim.geometry import Pose, carrying_pose, downward_pose
 from ba_torchrl.tasks.manipulation.pick_place_commands import (
     LEVEL_RAD,
-    carrying_pose,
     no_op,
     pick_command,
     place_command,

@@ -21,16 +21,12 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import Phase, TestedPolicy, read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import protocol
-from ba_torchrl.training.checkpoint import (
-    Checkpoints,
-    build_algorithm,
-    find_checkpoint,
-    load,
-)
+from ba_torchrl.training.checkpoint import Checkpoints, find_checkpoint, load
 from ba_torchrl.training.collection import gather_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
+from ba_torchrl.training.learner import build_algorithm
 from ba_torchrl.training.precision import precision
 from tests.recipes import recipe
 

@@ -28,15 +28,14 @@ from ba_torchrl.modules.spatial.base import (
 )
 from ba_torchrl.modules.spatial.in_hand import InHandMap
 from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
-from ba_torchrl.modules.spatial.unet import PlainPixelValues
-from ba_torchrl.modules.spatial.views import (
-    HeightView,
+from ba_torchrl.modules.spatial.pose_views import (
     PoseGridConfig,
     TiltedView,
     UprightView,
-    centre_fit,
     is_six_dof,
 )
+from ba_torchrl.modules.spatial.unet import PlainPixelValues
+from ba_torchrl.modules.spatial.views import HeightView, centre_fit
 
 View = Callable[[Tensor, Tensor], Tensor]
 """From heightmaps [B, 1, H, W] and the indices chosen so far [B, n] to what a later level sees."""

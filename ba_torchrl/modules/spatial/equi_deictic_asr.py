@@ -12,7 +12,7 @@ from ba_torchrl.modules.spatial.equi_asr import (
     SceneVector,
 )
 from ba_torchrl.modules.spatial.pose_values import FingerSymmetricValues, PoseValues, SceneMapVector
-from ba_torchrl.modules.spatial.views import (
+from ba_torchrl.modules.spatial.pose_views import (
     BothFingerOrders,
     PoseGridConfig,
     TiltedView,

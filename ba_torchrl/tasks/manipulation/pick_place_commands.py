@@ -8,7 +8,7 @@ import numpy as np
 
 from ba_torchrl.core.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.sim.bodies import Body
-from ba_torchrl.sim.geometry import Pose, tool_angles
+from ba_torchrl.sim.geometry import Pose, carrying_pose, tool_angles
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
@@ -34,11 +34,6 @@ def place_command(tool: Pose, held: Pose, target: Pose) -> PickPlaceCommand:
         target: pose of the held body at its release.
     """
     return _command(PLACE, carrying_pose(tool, held, target))
-
-
-def carrying_pose(tool: Pose, held: Pose, target: Pose) -> Pose:
-    """Return the pose of the tool that brings the held body to a pose."""
-    return target.compose(held.inverse().compose(tool))
 
 
 def swaps_fingers(tool: Pose) -> bool:

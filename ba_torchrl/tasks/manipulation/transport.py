@@ -10,14 +10,13 @@ from collections.abc import Sequence
 
 from ba_torchrl.core.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, vertical_extent
-from ba_torchrl.sim.geometry import Vector
+from ba_torchrl.sim.geometry import Vector, carrying_pose
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.tasks.manipulation.clearance import (
     finger_extent_m,
     grasp_clearance_m,
     tips_below_tool_m,
 )
-from ba_torchrl.tasks.manipulation.pick_place_commands import carrying_pose
 from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_RAD,
     CLOSED,

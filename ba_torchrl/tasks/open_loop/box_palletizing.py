@@ -12,7 +12,7 @@ from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
-from ba_torchrl.sim.geometry import Pose, Vector
+from ba_torchrl.sim.geometry import Pose, Vector, carrying_pose
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
@@ -21,7 +21,6 @@ from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.manipulation.pick_place_commands import (
     LEVEL_RAD,
-    carrying_pose,
     no_op,
     perturbed_pick,
     pick_command,

@@ -8,10 +8,9 @@ from collections.abc import Sequence
 from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
-from ba_torchrl.sim.geometry import Pose, quaternion_matrix, quaternion_yaw
+from ba_torchrl.sim.geometry import Pose, carrying_pose, quaternion_matrix, quaternion_yaw
 from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.manipulation.pick_place_commands import (
-    carrying_pose,
     no_op,
     perturbed_pick,
     pick_command,

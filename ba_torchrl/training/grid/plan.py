@@ -287,7 +287,7 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
     """
     import torch
 
-    from ba_torchrl.training.checkpoint import build_algorithm, problem_of
+    from ba_torchrl.training.learner import build_algorithm, problem_of
 
     problems: dict[tuple[str, str], Problem] = {}
     built = set()

@@ -3,9 +3,9 @@
 import torch
 
 from ba_torchrl.core import keys
-from ba_torchrl.training.checkpoint import build_algorithm
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.learner import build_algorithm
 
 SEED = 7
 TINY = {
