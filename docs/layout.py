@@ -1,47 +1,70 @@
-"""Print what is large: files, classes far below a base, and what one reads for three subjects.
+"""Print what is large: files, classes far below a base, and what one reads for six subjects.
 
 python -m docs.layout
 
-It is advice: a long file may have one subject. The lines to read for a subject are those of all
-classes and functions of its folders that are reached by name from an entry: a definition counts
-with all of its lines, as do those that it names in its body, its annotations, its decorators and
-its bases. Module-level code does not count, nor does what an object's methods do whose class is
-named nowhere.
+It is advice: a long file may have one subject. To read for a subject are the files of its folders,
+as a whole, with the classes and functions that are reached by name from its entry, in the order in
+which a reader meets them. A definition reaches those that it names in its body, its annotations,
+its decorators and its bases; module-level code reaches nothing.
 """
 
 from __future__ import annotations
 
-from docs.sources import PACKAGE, ROOT, Definition, definitions, sources
+from typing import NamedTuple
+
+from docs.sources import PACKAGE, ROOT, Definition, definitions, file_of, sources
 
 MOST_LINES, MOST_LEVELS = 400, 2
 SETTINGS = Definition(f"{PACKAGE}.core.config", "StrictModel")
 """Base of all settings, as pydantic's `BaseModel`; it is no level."""
-SUBJECTS = {
-    "close_loop/block_stacking with its expert": (
-        Definition(f"{PACKAGE}.tasks.close_loop.block_stacking", "BlockStacking"),
-        (f"{PACKAGE}.tasks.",),
-    ),
-    "SACfD": (
-        Definition(f"{PACKAGE}.algorithms.sac", "SAC"),
-        (f"{PACKAGE}.algorithms.", f"{PACKAGE}.objectives."),
-    ),
-    "a training run": (
-        Definition(f"{PACKAGE}.commands.train", "main"),
-        (f"{PACKAGE}.cli.", f"{PACKAGE}.commands.", f"{PACKAGE}.training.", f"{PACKAGE}.record."),
-    ),
-}
-"""By subject, the entry, and the folders that one reads."""
 
 
-def to_read(entry: Definition, folders: tuple[str, ...]) -> set[Definition]:
-    """Return the definitions of the folders that are reached by name from an entry."""
-    found: set[Definition] = set()
-    waiting = {entry}
-    while waiting:
-        found |= waiting
-        uses = set().union(*(each.uses for each in waiting))
-        waiting = {each for each in uses - found if each.module.startswith(folders)}
-    return found
+class Subject(NamedTuple):
+    """What one reads: from which definitions on, in which folders, and in how many lines."""
+
+    title: str
+    entries: tuple[str, ...]
+    folders: tuple[str, ...]
+    aim: int | None = None
+
+
+SUBJECTS = (
+    Subject(
+        "close_loop/block_stacking with its expert",
+        ("tasks.close_loop.block_stacking.BlockStacking",),
+        ("tasks",),
+        2000,
+    ),
+    Subject(
+        "open_loop/block_stacking with its expert",
+        ("tasks.open_loop.block_stacking.BlockStacking",),
+        ("tasks",),
+    ),
+    Subject("SACfD", ("algorithms.sac.SACConfig",), ("algorithms", "objectives"), 1800),
+    Subject(
+        "SDQfD with Equi ASR",
+        ("algorithms.spatial_q.SpatialQConfig", "modules.spatial.equi_asr.EquivariantASRConfig"),
+        ("algorithms", "objectives", "modules.spatial"),
+        1800,
+    ),
+    Subject("a training run", ("commands.train.main",), ("commands", "training"), 1700),
+    Subject("a step of an environment", ("envs.factory.make",), ("envs",)),
+)
+
+
+def to_read(subject: Subject) -> list[str]:
+    """Return the modules of a subject in the order in which they are opened."""
+    folders = tuple(f"{PACKAGE}.{folder}." for folder in subject.folders)
+    waiting = [Definition(*f"{PACKAGE}.{name}".rsplit(".", 1)) for name in subject.entries]
+    for definition in waiting:
+        new = (each for each in definition.names if each.module.startswith(folders))
+        waiting += [each for each in dict.fromkeys(new) if each not in waiting]
+    return list(dict.fromkeys(each.module for each in waiting))
+
+
+def length(module: str) -> int:
+    """Return the number of lines of a module."""
+    return len(file_of(module).read_text(encoding="utf-8").splitlines())
 
 
 def levels(definition: Definition) -> int:
@@ -63,9 +86,13 @@ def main() -> None:
         for name in definitions(module):
             if levels(Definition(module, name)) > MOST_LEVELS:
                 print(f"  {module}.{name}: {levels(Definition(module, name))}")
-    print("lines to read")
-    for subject, (entry, folders) in SUBJECTS.items():
-        print(f"  {subject}: {sum(each.lines for each in to_read(entry, folders))}")
+    print("files to read")
+    for subject in SUBJECTS:
+        modules = to_read(subject)
+        aim = f", aim {subject.aim}" if subject.aim else ""
+        print(f"  {subject.title}: {sum(map(length, modules))} lines in {len(modules)} files{aim}")
+        for module in modules:
+            print(f"    {length(module):4} {file_of(module).relative_to(ROOT / PACKAGE)}")
 
 
 if __name__ == "__main__":

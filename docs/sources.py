@@ -26,6 +26,12 @@ def sources() -> dict[str, ast.Module]:
     return trees
 
 
+def file_of(module: str) -> Path:
+    """Return the file of a module of the package."""
+    path = ROOT / module.replace(".", "/")
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
 @cache
 def imports(module: str) -> dict[str, str]:
     """Return what a module imports, in functions as well: from each local name to a dotted name."""
@@ -57,15 +63,9 @@ class Definition(NamedTuple):
         return definitions(self.module)[self.name]
 
     @property
-    def lines(self) -> int:
-        """Number of its lines, decorators, docstring and comments included."""
-        first = min(node.lineno for node in (self.node, *self.node.decorator_list))
-        return self.node.end_lineno - first + 1
-
-    @property
-    def uses(self) -> set[Definition]:
-        """What it names, itself included."""
-        return set(named([self.node], self.module)) | {self}
+    def names(self) -> list[Definition]:
+        """What it names, in the order of its text."""
+        return list(named([self.node], self.module))
 
     @property
     def bases(self) -> set[Definition]:
