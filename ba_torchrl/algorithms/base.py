@@ -272,11 +272,8 @@ class Learner(ABC):
         return scalars
 
     def compile(self, mode: CompileMode) -> None:
-        """Compile the loss and its gradient, except those of `make_pretraining`.
-
-        Raises:
-            ConfigError: the system has no compiler.
-        """
+        """Compile the loss and its gradient, except those of `make_pretraining`; see
+        `CompiledLoss`."""
         self.stages = [CompiledLoss(self.loss, mode, stage) for stage in self.stages]
 
     def _set_priorities(self, errors: dict[str, Tensor]) -> None:
@@ -364,11 +361,8 @@ class Learner(ABC):
 
 
 def _observed(found: Mapping[str, Any], names: Iterable[str], kind: str) -> dict[str, Any]:
-    """Return what is known of the observations that a network sees.
-
-    Raises:
-        ConfigError: the environment does not observe one.
-    """
+    """Return what is known of the observations that a network sees; `ConfigError` if one is
+    missing."""
     if missing := [name for name in names if name not in found]:
         raise ConfigError(
             f"the network sees {', '.join(missing)}; the environment observes "

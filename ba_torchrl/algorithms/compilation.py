@@ -18,11 +18,8 @@ from ba_torchrl.core.errors import ConfigError
 
 
 def check_compiler(device: torch.device) -> None:
-    """Check that the system has the compiler of `torch.compile`'s code for a device.
-
-    Raises:
-        ConfigError: it has none.
-    """
+    """Raise `ConfigError` unless the system has the compiler of `torch.compile`'s code for a
+    device."""
     if device.type == "cuda":  # Triton compiles the code that starts its kernels
         language, package = "C", "gcc"
         is_found = bool(os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang"))

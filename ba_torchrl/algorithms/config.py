@@ -60,11 +60,7 @@ class LearnerConfig(StrictModel, ABC):
         return 0
 
     def check(self, network: NetworkConfig, control: Control) -> None:
-        """Check that the algorithm supports the task's control, and that the network does.
-
-        Raises:
-            ConfigError: the algorithm or the network does not support this control.
-        """
+        """Raise `ConfigError` unless algorithm and network support the task's control."""
         if control not in self.controls:
             known = [name for name in ALGORITHMS if control in ALGORITHMS[name].controls]
             why = f"learns {' and '.join(sorted(self.controls))} tasks, not {control} ones"

@@ -112,11 +112,8 @@ class Optimizers(OptimizationStepper):
         return taken
 
     def of(self, terms: Collection[str]) -> list[Optimizer]:
-        """Return the optimisers that minimise a sum of terms.
-
-        Raises:
-            ValueError: the terms have different optimisers.
-        """
+        """Return the optimisers that minimise a sum of terms; `ValueError` if the terms have
+        different ones."""
         own = [list(self._of_terms[term].values()) for term in terms if term in self._of_terms]
         if not own:
             return [self._main]

@@ -57,22 +57,14 @@ class RLPDConfig(SACConfig):
         return "none" if self.init.name == "random" and self.imitation.name == "none" else "expert"
 
     def build(self, network: NetworkConfig, problem: Problem) -> RLPD:
-        """Return a freshly initialised learner.
-
-        Raises:
-            ConfigError: the subset exceeds the ensemble, or the network has no ensemble.
-        """
+        """Return a freshly initialised learner."""
         if self.subset > self.critics:
             raise ConfigError(f"subset: {self.subset} of {self.critics} critics cannot be drawn")
         return RLPD(self, network, problem)
 
 
 class RLPD(SAC):
-    """A squashed Gaussian policy and an ensemble of critics on a shared encoder.
-
-    Raises:
-        ConfigError: the network has no ensemble.
-    """
+    """A squashed Gaussian policy and an ensemble of critics on a shared encoder."""
 
     config: RLPDConfig
     loss: RLPDLoss

@@ -103,11 +103,7 @@ class SACConfig(LearnerConfig):
 
 
 class SAC(Learner):
-    """A squashed Gaussian policy and twin critics on a shared encoder.
-
-    Raises:
-        ConfigError: an image is smaller than its crop.
-    """
+    """A squashed Gaussian policy and twin critics on a shared encoder."""
 
     config: SACConfig
     loss: SACfDLoss
@@ -150,13 +146,7 @@ class SAC(Learner):
     def make_loss(
         self, networks: ActorCritic, kind: type[SACfDLoss] = SACfDLoss, **options: Any
     ) -> SACfDLoss:
-        """Return the loss of actor, critics, temperature and, if configured, encoder.
-
-        Args:
-            networks: actor, encoder and critic.
-            kind: its class.
-            options: that only this class has.
-        """
+        """Return the loss of actor, critics, temperature and, if configured, encoder."""
         config = self.config
         loss = kind(
             self.make_policy(networks),

@@ -21,11 +21,6 @@ def make_spatial_values(
 ) -> SpatialValues:
     """Return a freshly initialised network, wrapped as values of the environment's actions.
 
-    Args:
-        network: builds it.
-        problem: actions and device.
-        images: declarations of the network's input images.
-
     Raises:
         ValueError: the network does not support the images or the actions.
     """
@@ -49,11 +44,6 @@ def demonstration_on_grid(
 
     If the nearest yaw of a pick close to half a turn is zero, the fingers are swapped, and the
     images with the gripper's axes are reversed while the picked object is held.
-
-    Args:
-        episode: a demonstration.
-        grid: of the network's actions.
-        images: declarations of the network's input images.
     """
     action = episode[keys.ACTION]
     out = episode.copy().set(keys.ACTION, grid.nearest(action))

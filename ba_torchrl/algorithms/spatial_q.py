@@ -77,11 +77,7 @@ class SpatialQConfig(LearnerConfig):
 
 
 class SpatialQ(Learner):
-    """A network of spatial Q values with a target network that is copied at intervals.
-
-    Raises:
-        ValueError: the network or the augmentation does not support the task's images or actions.
-    """
+    """A network of spatial Q values with a target network that is copied at intervals."""
 
     config: SpatialQConfig
     loss: LevelDQNLoss

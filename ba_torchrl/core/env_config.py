@@ -184,15 +184,7 @@ class EnvConfig(StrictModel):
         return self.camera_size or self.obs_size
 
     def check_control(self, task_id: str, control: str) -> None:
-        """Check that the parameters that differ from their defaults apply to a control.
-
-        Args:
-            task_id: for the message.
-            control: "open_loop" or "close_loop".
-
-        Raises:
-            ConfigError: one applies to the other control only.
-        """
+        """Raise `ConfigError` if a parameter of the other control differs from its default."""
         for name in sorted(EnvConfig.model_fields.keys() - self.fields_for(control)):
             if getattr(self, name) != EnvConfig.model_fields[name].default:
                 kind = "close-loop" if control == "open_loop" else "open-loop"
@@ -200,11 +192,7 @@ class EnvConfig(StrictModel):
 
     @classmethod
     def fields_for(cls, control: str) -> set[str]:
-        """Return the names of the fields that apply to a control.
-
-        Args:
-            control: "open_loop" or "close_loop".
-        """
+        """Return the names of the fields that apply to "open_loop" or "close_loop"."""
         return {
             name
             for name, field in cls.model_fields.items()

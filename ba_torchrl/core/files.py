@@ -222,10 +222,6 @@ def check(folder: str | Path) -> None:
 def write_state(folder: str | Path, state: Mapping[str, Any]) -> None:
     """Write a nested state of tensors and plain values into a folder, without checksums.
 
-    Args:
-        folder: created if needed.
-        state: as ``state_dict`` returns.
-
     Raises:
         OSError: there is not enough space, or a file cannot be written.
         TypeError: a value is neither a tensor, an array nor plain.
@@ -239,11 +235,7 @@ def write_state(folder: str | Path, state: Mapping[str, Any]) -> None:
 
 
 def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
-    """Write a safetensors file.
-
-    Raises:
-        OSError: there is not enough space, or the file cannot be written.
-    """
+    """Write a safetensors file."""
     from safetensors.torch import save_file
 
     try:
@@ -260,12 +252,7 @@ def json_bytes(path: str | Path) -> bytes:
 
 
 def read_json(path: str | Path) -> Any:
-    """Return the content of a JSON file.
-
-    Raises:
-        OSError: it cannot be read.
-        ValueError: it is not JSON.
-    """
+    """Return the content of a JSON file; `ValueError` if it is not JSON."""
     return json.loads(json_bytes(path))
 
 
@@ -333,28 +320,17 @@ class StateFolder:
     """
 
     def dumps(self, path: str | Path) -> None:
-        """Write the state into a folder.
-
-        Raises:
-            OSError: there is not enough space, or a file cannot be written.
-        """
+        """Write the state into a folder; see `write_state`."""
         write_state(path, self.state_dict())
 
     def loads(self, path: str | Path) -> None:
-        """Read a folder that ``dumps`` wrote.
-
-        Raises:
-            DamagedFilesError: the files are not a state.
-        """
+        """Read a folder that ``dumps`` wrote; see `read_state`."""
         self.load_state_dict(read_state(path))
 
 
 def _files(folder: Path) -> Iterator[Path]:
-    """Yield the files of data below a folder, without hidden files and texts.
-
-    Raises:
-        ConfigError: one of them is not plain data.
-    """
+    """Yield the files of data below a folder, without hidden files and texts; `ConfigError` if one
+    of them is not plain data."""
     for path in sorted(folder.rglob("*")):
         is_hidden = any(part.startswith(".") for part in path.relative_to(folder).parts)
         if is_hidden or path.suffix in _TEXT_SUFFIXES:

@@ -64,11 +64,7 @@ def processor() -> str:
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """Return a description of the hardware of a run.
-
-    Args:
-        device: of the learner.
-    """
+    """Return a description of the hardware of a run with its learner on ``device``."""
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {
         "cpu": processor(),

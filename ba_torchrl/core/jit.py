@@ -14,9 +14,6 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Return the decorator `numba.njit` with a cache on disk.
 
     Without a writable folder, a warning says so once and each process compiles the function.
-
-    Args:
-        options: of `numba.njit`.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -72,9 +72,6 @@ def module_names(modules: Iterable[str | ModuleType]) -> tuple[str, ...]:
 def import_modules(names: Iterable[str]) -> None:
     """Import plugins by name.
 
-    Args:
-        names: dotted names of modules.
-
     Raises:
         ConfigError: a module does not exist, and the message names possible fixes; or it raises at
             its import, which is the cause.
@@ -107,14 +104,7 @@ def _summary(error: BaseException) -> str:
 
 
 def load_plugins(names: Iterable[str]) -> None:
-    """Import the plugins of a recipe or a run, also from the current directory.
-
-    Args:
-        names: dotted names of modules.
-
-    Raises:
-        ConfigError: a module does not exist.
-    """
+    """Import the plugins of a recipe or a run, also from the current directory."""
     if isinstance(names, str) or not isinstance(names, Iterable):
         raise ConfigError(f"plugins: must be a list of names of modules, got {names!r}")
     names = list(names)
@@ -124,16 +114,8 @@ def load_plugins(names: Iterable[str]) -> None:
 
 
 def check_known(names: Iterable[str], file: str | Path) -> None:
-    """Check that this process has imported the plugins that a file names, which may come from
-    somebody else, or that an installed package declares them. None is imported.
-
-    Args:
-        names: dotted names of modules.
-        file: that names them.
-
-    Raises:
-        ConfigError: it is not so; the message says how to import them.
-    """
+    """Raise `ConfigError` unless this process has imported the plugins that a file names, which may
+    come from somebody else, or an installed package declares them. None is imported."""
     installed = {point.module for point in entry_points(group=GROUP)}
     unknown = [name for name in names if name not in sys.modules and name not in installed]
     if unknown:

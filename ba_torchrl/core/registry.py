@@ -81,19 +81,11 @@ class Registry(Generic[T]):
         return next(known, getattr(entry, "__name__", repr(entry)))
 
     def entry(self, name: str) -> T:
-        """Return an entry; if it is registered, without the imports of the first look-up.
-
-        Raises:
-            UnknownNameError: nothing is registered under ``name``.
-        """
+        """Return an entry; if it is registered, without the imports of the first look-up."""
         return self._entries[name] if name in self._entries else self[name]
 
     def plugin_module(self, name: str) -> str | None:
-        """Return the module outside the package that registered ``name``; None if it is built in.
-
-        Raises:
-            UnknownNameError: nothing is registered under ``name``.
-        """
+        """Return the module outside the package that registered a name; None if it is built in."""
         self.entry(name)
         module = self._modules[name]
         return None if module.partition(".")[0] == PACKAGE else module

@@ -141,12 +141,7 @@ def load_demonstrations(
 
 
 def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, Any]]:
-    """Return the episodes of a folder that `save_demonstrations` wrote, and its metadata.
-
-    Raises:
-        ConfigError: there are none at ``path``, their files are damaged, or their task has another
-            version.
-    """
+    """Return the episodes of a folder that `save_demonstrations` wrote, and its metadata."""
     path = Path(path)
     if os.path.exists(path) and not os.path.exists(path / METADATA_FILE):
         raise ConfigError(

@@ -75,11 +75,7 @@ class Episodes:
         return self.scene_for(float(self.scales[-1]))
 
     def check_starts(self) -> None:
-        """Start one episode with the smallest objects and one with the largest.
-
-        Raises:
-            PlacementError: the objects do not fit the workspace.
-        """
+        """Start one episode with the smallest objects and one with the largest, which must fit."""
         for scale in {float(self.scales[0]), float(self.scales[-1])}:
             self.initialize(self.scene_for(scale), np.random.default_rng(0))
 

@@ -25,9 +25,6 @@ def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv:
             `resolve_env` returned.
         config: fields of `ba_torchrl.core.env_config.EnvConfig` and of the task's own parameters,
             such as ``robot="kuka"``, ``obs_size=64``, ``seed=0`` or ``expert=True``; and ``device``
-
-    Raises:
-        ConfigError: as for `BulletArmEnv`.
     """
     return BulletArmEnv(task, **config)
 

@@ -28,14 +28,11 @@ FARTHEST_M = 10.0
 
 
 def check_bodies(scene: Scene, *, may_be_lost: bool = False) -> None:
-    """Check that the state of a scene is one that the physics engine can continue from.
+    """Raise `SimulationError` unless the state of a scene is one that the physics engine can
+    continue from.
 
     Args:
         may_be_lost: check only that poses and joint angles are finite.
-
-    Raises:
-        SimulationError: a pose or a joint angle is not finite, or a visible body is below the floor
-            or far away.
     """
     if not math.isfinite(sum(scene.robot.measured_joints())):
         raise SimulationError("a joint of the robot is not finite")

@@ -30,11 +30,7 @@ class Control(Protocol):
 
     @classmethod
     def make_actions(cls, config: EnvConfig) -> CloseLoopActions | OpenLoopActions:
-        """Return the action space.
-
-        Args:
-            config: the parameters, with defaults filled in.
-        """
+        """Return the action space."""
 
 
 CONTROLS: Registry[type[Control]] = Registry("kind of control", "ba_torchrl.envs")
@@ -228,11 +224,7 @@ def _with_defaults(task_class: type[Task], config: EnvConfig) -> EnvConfig:
 
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:
-    """Check that scales are within the limits of a task.
-
-    Raises:
-        ConfigError: a scale is outside the limits.
-    """
+    """Raise `ConfigError` unless scales are within the limits of a task."""
     least, most = TASKS[task_id].scale_limits
     low, high = scales
     if round(low, 6) < least or round(high, 6) > most:

@@ -372,11 +372,8 @@ class SACfDLoss(TransitionLoss):
         return self._over_views(distance)
 
     def _demonstration_flag(self, tensordict: TensorDictBase) -> Tensor:
-        """Return the flag of demonstrations, bool [..., B]; False for plain SAC without it.
-
-        Raises:
-            KeyError: the flag is absent, and the behaviour term needs it.
-        """
+        """Return the flag of demonstrations, bool [..., B]; without a behaviour term, False if it
+        is absent."""
         flag = tensordict.get(self.tensor_keys.is_demonstration, None)
         if flag is not None:
             return flag.reshape(tensordict.batch_size)

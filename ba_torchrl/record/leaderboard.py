@@ -70,9 +70,6 @@ def leaderboard(
     Runs of other versions of the task or its expert, of another protocol, or with fewer test
     episodes than can be cited are left out. Own runs are not pooled with those of the package; a
     method of both has a second column.
-
-    Raises:
-        ConfigError: runs have the same settings and seed.
     """
     left_out: list[str] = []
     shipped, beside = ([], [])

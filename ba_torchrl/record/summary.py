@@ -268,9 +268,6 @@ def grouped(runs: Iterable[Run]) -> list[Group]:
     """Group runs that differ in their seed only, in the order of tasks and methods.
 
     Methods with several settings get distinct names.
-
-    Raises:
-        ConfigError: runs have the same settings and seed.
     """
     alike: list[list[Run]] = []
     for run in runs:

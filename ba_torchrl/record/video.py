@@ -66,9 +66,6 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
 
     The frames [H, W, 3] are uint8 of equal size. For ``.mp4``, an odd height or width is padded
     with a copy of the last row or column.
-
-    Raises:
-        OSError: there is not enough space, or the file cannot be written.
     """
     import imageio
     import imageio_ffmpeg

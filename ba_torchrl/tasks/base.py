@@ -380,11 +380,7 @@ class Versions(NamedTuple):
 
 
 def versions_of(task_id: str) -> Versions:
-    """Return the versions of a registered task and of its expert.
-
-    Raises:
-        UnknownNameError: there is no such task.
-    """
+    """Return the versions of a registered task and of its expert."""
     task_class = TASKS.entry(task_id)
     return Versions(task_class.version, task_class.expert_version)
 

@@ -65,11 +65,8 @@ _VERSIONS = ("task_version", "expert_version")
 
 
 def lock_run(folder: Path) -> Lock:
-    """Lock a run folder, which is created if needed.
-
-    Raises:
-        ConfigError: another process holds the lock; the message names it.
-    """
+    """Lock a run folder, which is created if needed; `ConfigError` names the process that holds the
+    lock."""
     folder.mkdir(parents=True, exist_ok=True)
     return Lock(folder / LOCK_FILE, f"runs the experiment in {folder}")
 
@@ -91,12 +88,8 @@ def lock_holder(folder: Path) -> str | None:
 
 
 def open_run_folder(config: ExperimentConfig) -> None:
-    """Make the run folder and write the configuration into it.
-
-    Raises:
-        ConfigError: it holds a run that is finished, or that has other settings, or that
-            ``resume`` does not ask for; the message names the reason.
-    """
+    """Make the run folder and write the configuration into it. `ConfigError` if it holds another
+    run, a finished one, or one that is not to be resumed."""
     folder = config.folder
     if (folder / CONFIG_FILE).exists():
         if (folder / RESULT_FILE).exists():
@@ -157,27 +150,15 @@ def write_config(config: ExperimentConfig) -> None:
 
 
 def read_config(folder: str | Path, **changes: Any) -> ExperimentConfig:
-    """Read the configuration of a run folder. Plugins that it names are not imported.
-
-    Args:
-        folder: the run folder.
-        changes: fields to override.
-
-    Raises:
-        ConfigError: there is none, it does not parse, or it names plugins that are neither imported
-            nor installed.
-    """
+    """Return the configuration of a run folder with ``changes``; plugins that it names are not
+    imported."""
     saved = _read(folder)
     values = {name: value for name, value in saved.items() if name not in _VERSIONS}
     return parse_saved(values, Path(folder) / CONFIG_FILE, **changes)
 
 
 def read_versions(folder: str | Path) -> Versions:
-    """Return the versions of task and expert with which the run in a folder was started.
-
-    Raises:
-        ConfigError: there is no run, or it does not say them.
-    """
+    """Return the versions of task and expert with which the run in a folder was started."""
     saved = _read(folder)
     found = [saved.get(name) for name in _VERSIONS]
     if not all(isinstance(version, int) for version in found):
@@ -196,16 +177,8 @@ def _read(folder: str | Path) -> dict[str, Any]:
 
 
 def parse_saved(saved: dict[str, Any], file: str | Path, **changes: Any) -> ExperimentConfig:
-    """Return the configuration that a file holds. Plugins that it names are not imported.
-
-    Args:
-        saved: the configuration.
-        file: that holds it.
-        changes: fields to override.
-
-    Raises:
-        ConfigError: it does not parse, or it names plugins that are neither imported nor installed.
-    """
+    """Return the configuration that a file holds with ``changes``; plugins that it names are not
+    imported, and must be known (`check_known`)."""
     plugins = saved.get("plugins")
     if isinstance(plugins, list) and "plugins" not in changes:
         check_known(map(str, plugins), file)
@@ -244,11 +217,7 @@ class DurableCheckpoint(Checkpoint):
             self.register(name, component, adapter=_StateAdapter())
 
     def save(self, path: str | Path, **options: Any) -> Path:
-        """Write a checkpoint; see TorchRL.
-
-        Raises:
-            OSError: there is not enough space.
-        """
+        """Write a checkpoint; see TorchRL."""
         path = Path(path)
         with complete_only(path, replace=True) as scratch:
             super().save(scratch, **options)
@@ -276,11 +245,7 @@ class DurableCheckpoint(Checkpoint):
 
     @classmethod
     def manifest(cls, path: str | Path) -> dict[str, Any]:
-        """Read the manifest of a checkpoint; see TorchRL.
-
-        Raises:
-            CheckpointError: it is none.
-        """
+        """Read the manifest of a checkpoint; see TorchRL."""
         try:
             return super().manifest(path)
         except AttributeError as error:  # TorchRL expects that the file holds a mapping
@@ -337,11 +302,6 @@ class Checkpoints:
     """The checkpoints of a run folder: the latest ones and the best.
 
     Each gets its final name when it is complete on the disk, with checksums of its files.
-
-    Args:
-        folder: the run folder.
-        algorithm: what to save.
-        keep_last: how many of the latest to keep.
     """
 
     def __init__(self, folder: Path, algorithm: Learner, keep_last: int = 2) -> None:
@@ -447,11 +407,6 @@ class ResumeState:
 
     Each state gets its final name when it is complete on the disk, with checksums of its files. The
     last two are kept: if the newest is damaged, the run continues from the one before.
-
-    Args:
-        folder: the run folder.
-        algorithm: whose state and replay are saved.
-        state: the run's counters and curve.
     """
 
     def __init__(self, folder: Path, algorithm: Learner, state: RunState) -> None:
@@ -472,10 +427,7 @@ class ResumeState:
 
     def load(self) -> bool:
         """Restore the newest state whose files are whole; return whether there is any state.
-
-        Raises:
-            ConfigError: all states are damaged, or hold files that are not plain data.
-        """
+        `ConfigError` if all are damaged."""
         remove_leftovers(self._folder)
         states = saved_steps(self._folder)
         if not states:

@@ -32,8 +32,7 @@ def make_env(config: ExperimentConfig, seed: int, **changes: Any) -> EnvBase:
     Args:
         config: of the run.
         seed: of the first environment.
-        changes: keywords of `make_vector_env` that differ from the run's; by default, failed
-            processes are waited for.
+        changes: keywords of `make_vector_env`; by default, failed processes are waited for.
     """
     options = {"seed": seed, "wait_for_restarts": True, **changes}
     return make_vector_env(config.resolved_env, config.num_envs, workers=config.workers, **options)
@@ -45,14 +44,7 @@ def start_collection(
     seed: int,
     positions: Sequence[EpisodePosition] | None,
 ) -> Collection:
-    """Start the collector of a run.
-
-    Args:
-        config: of the run.
-        algorithm: whose policy explores.
-        seed: of the first environment.
-        positions: from which the environments continue; None to start new episodes.
-    """
+    """Start the collector of a run; see `CollectorConfig.start`."""
     values = config.model_dump(mode="json")  # which other processes read, plugins first
     problem = CollectionProblem(
         algorithm=algorithm,
@@ -90,13 +82,8 @@ def gather_demonstrations(
 ) -> list[TensorDict]:
     """Return the episodes [T] of a run's demonstrations, read from a folder or played now.
 
-    Args:
-        config: of the run.
-        algorithm: whose policy must be able to choose the demonstrated actions.
-        on_episode: called with each episode that is played.
-
-    Raises:
-        ConfigError: too few episodes of the folder, or of those that are played, can be used.
+    Those that are played have actions that the policy of ``algorithm`` can choose, and are given to
+    ``on_episode``. If too few can be used, `ConfigError` is raised.
     """
     if config.demonstrations_path is not None:
         episodes = load_demonstrations(

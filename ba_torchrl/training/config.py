@@ -267,11 +267,7 @@ class ExperimentConfig(WorkerOptions):
 
     @classmethod
     def check_fields(cls, values: dict[str, Any], what: str = "experiment") -> ExperimentConfig:
-        """Validate everything that needs no torch: the fields, and those of the environment.
-
-        Raises:
-            ConfigError: as `parse`.
-        """
+        """Validate everything that needs no torch: the fields, and those of the environment."""
         config = parse(cls, values, what)
         load_plugins(config.plugins)
         for reserved in SET_BY_THE_EXPERIMENT:
@@ -341,14 +337,8 @@ class ExperimentConfig(WorkerOptions):
 
 
 def usable_device(name: str) -> torch.device:
-    """Return a device that can compute.
-
-    Args:
-        name: as of `torch.device`; "auto" for a GPU if there is one, else the CPU.
-
-    Raises:
-        ConfigError: there is no such device.
-    """
+    """Return a device that can compute, named as in torch; "auto" for a GPU if there is one, else
+    the CPU. `ConfigError` if it does not exist."""
     import torch
 
     try:
@@ -379,13 +369,7 @@ def _registries() -> dict[str, Any]:
 def choose(registry: Any, values: dict[str, Any], kind: str) -> Any:
     """Return the registered configuration class called ``values["name"]``, filled in.
 
-    Args:
-        registry: of configuration classes.
-        values: ``name`` and fields of that class.
-        kind: what is chosen, for error messages.
-
-    Raises:
-        ConfigError: the name is missing or unknown, or a field is.
+    ``kind`` says what is chosen, for the `ConfigError` of unknown names and values.
     """
     rest = dict(values)
     name = rest.pop("name", None)

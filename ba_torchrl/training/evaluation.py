@@ -67,15 +67,7 @@ def evaluate(
     seed: int,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> Evaluation:
-    """Play greedy episodes from a seed, a fixed number per environment; the weights stay constant.
-
-    Args:
-        env: a vector of environments.
-        policy: acts greedily under TorchRL's deterministic exploration type.
-        episodes: total number.
-        seed: of the first episodes.
-        on_episode: called with each episode, for progress bars.
-    """
+    """Play greedy episodes from a seed, as many per environment; the weights stay constant."""
     with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
         played = collect_episodes(
             env,

@@ -206,9 +206,6 @@ class GradedSets:
 def untrained(sets: GradedSets) -> tuple[ExperimentConfig, Learner]:
     """Return the configuration of medium and its learner before any update.
 
-    Args:
-        sets: task, parameters, episodes and seed.
-
     Raises:
         ConfigError: the parameters are wrong, or the network does not take the images.
     """
@@ -233,11 +230,6 @@ def half_trained(
 
     It is evaluated at intervals. Where its success rate passes over `SELECTED` within one, the
     interval is trained again in halves.
-
-    Args:
-        sets: task, parameters and seed.
-        env: where it is evaluated.
-        demonstrations: episodes of the expert.
 
     Returns:
         The policy, and how it was trained.

@@ -183,12 +183,7 @@ def preset(group: str, name: str) -> dict[str, Any]:
 
 
 def presets_of(group: str, names: Iterable[str]) -> list[str]:
-    """Return the names of the presets whose registered name is one of some names.
-
-    Args:
-        group: folder in ``configs``, such as "algorithm".
-        names: in the group's registry.
-    """
+    """Return the names of the presets whose registered name is one of some names."""
     return [each for each in preset_names(group) if preset(group, each)["name"] in names]
 
 

@@ -24,12 +24,7 @@ class Interruption(BaseException):
 
 
 class RunStopped(SystemExit):
-    """A signal ended the run; the message says what was saved. The exit code is 128 + signal.
-
-    Args:
-        message: one line.
-        signum: number of the signal.
-    """
+    """A signal ended the run; the message says what was saved. The exit code is 128 + signal."""
 
     def __init__(self, message: str, signum: int) -> None:
         super().__init__(128 + signum)
@@ -64,12 +59,7 @@ class StopSignals:
             raise Interruption
 
     def stopped(self, is_saved: bool, folder: Path) -> RunStopped:
-        """Return the exception that ends the process.
-
-        Args:
-            is_saved: whether the state is saved.
-            folder: of the run.
-        """
+        """Return the exception that ends the process."""
         name = signal.Signals(self._received).name
         what = "state saved" if is_saved else "nothing to save yet"
         return RunStopped(

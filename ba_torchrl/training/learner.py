@@ -11,15 +11,8 @@ from ba_torchrl.training.config import ExperimentConfig
 
 
 def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) -> Learner:
-    """Build the untrained algorithm of an experiment.
-
-    Args:
-        config: of the experiment.
-        problem: what `problem_of` returns for it, if that is known.
-
-    Raises:
-        ConfigError: task, algorithm and network do not go together.
-    """
+    """Build the untrained algorithm of an experiment, of a `problem_of` that may be known already.
+    `ConfigError` if task, algorithm and network do not go together."""
     problem = problem or problem_of(config)
     torch.manual_seed(config.seed)
     try:
@@ -31,11 +24,7 @@ def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) ->
 
 
 def problem_of(config: ExperimentConfig) -> Problem:
-    """Return what the algorithm of an experiment must know of its environment.
-
-    Raises:
-        ConfigError: the environment cannot be made.
-    """
+    """Return what the algorithm of an experiment must know of its environment."""
     env = make(config.resolved_env)
     env.close()
     return Problem(

@@ -51,11 +51,8 @@ class Result:
 
 
 def check_packages(config: ExperimentConfig) -> None:
-    """Check that the packages are installed that the run needs when it ends.
-
-    Raises:
-        MissingPackageError: one is not.
-    """
+    """Raise `MissingPackageError` unless the packages are installed that the run needs when it
+    ends."""
     needed = ["matplotlib", *(("imageio", "imageio_ffmpeg") if config.video_episodes else ())]
     if missing := [name.replace("_", "-") for name in needed if find_spec(name) is None]:
         what = "a run's curve and video need packages that are not installed"
@@ -99,11 +96,8 @@ def write_record(
     """Write the run's result as JSON; return the file.
 
     Args:
-        config: of the run.
-        algorithm: whose policy was tested.
         last: test of the policy that training ended with.
         best: test of the checkpoint with the best evaluation.
-        state: learning curve, counts and times.
         files: the run's other files by name; None for one that was not written.
     """
     folder, task = config.folder.resolve(), config.resolved_env.task_class

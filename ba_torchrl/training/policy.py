@@ -181,9 +181,6 @@ class TrainedPolicy(TensorDictModuleBase):
         Args:
             changes: fields of `ba_torchrl.core.env_config.EnvConfig` with other values, such as
                 ``seed=0``.
-
-        Raises:
-            ConfigError: as `ba_torchrl.make`.
         """
         return make(self.task, **{**self.env_config, **changes})
 
@@ -409,12 +406,7 @@ def tested_card(card: PolicyCard, record: RunResult) -> PolicyCard:
 
 
 def policy_result(policy: TrainedPolicy, test: TestedPolicy) -> RunResult:
-    """Return the record of the test of a policy from a file, on this machine.
-
-    Args:
-        policy: from a file.
-        test: of the policy, under the protocol.
-    """
+    """Return the record of the test of a policy from a file, on this machine."""
     config, card = policy.config, policy.card
     settings = config.resolved()
     for name in ("run_dir", "resume", "device"):
@@ -448,11 +440,7 @@ def policy_result(policy: TrainedPolicy, test: TestedPolicy) -> RunResult:
 
 
 def read_card(path: str | Path) -> PolicyCard:
-    """Read the card of a policy's file.
-
-    Raises:
-        ConfigError: there is none, or it is not a card.
-    """
+    """Read the card of a policy's file."""
     file = Path(path).with_suffix(CARD)
     try:
         return PolicyCard.model_validate_json(json_bytes(file))

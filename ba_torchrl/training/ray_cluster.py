@@ -10,14 +10,7 @@ from ba_torchrl.core.errors import ConfigError, install_command
 
 
 def check_installed(option: str) -> None:
-    """Check that Ray is installed.
-
-    Args:
-        option: that needs it, such as "collector".
-
-    Raises:
-        ConfigError: it is not.
-    """
+    """Raise `ConfigError` unless Ray is installed, which ``option`` needs."""
     if find_spec("ray") is None:
         raise ConfigError(
             f"{option}: 'ray' needs a package that is not installed: {install_command('ray')}"
@@ -46,16 +39,8 @@ def connected_ray(address: str | None) -> ModuleType:
 
 
 def check_resources(option: str, cpus: float, gpus: float) -> None:
-    """Check that the machines of the connected cluster together have some resources.
-
-    Args:
-        option: that needs them, such as "collector".
-        cpus: number of CPU cores.
-        gpus: number of GPUs.
-
-    Raises:
-        ConfigError: they have not; Ray would wait for them forever.
-    """
+    """Raise `ConfigError` unless the machines of the connected cluster together have the resources
+    that ``option`` needs; Ray would wait for them forever."""
     found = ray_module().cluster_resources()
     for name, needed in (("CPU", cpus), ("GPU", gpus)):
         if needed > found.get(name, 0.0):

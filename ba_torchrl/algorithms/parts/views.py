@@ -57,11 +57,8 @@ class Crop(_Random):
     """Rows and columns, pixels."""
 
     def seen(self, images: Mapping[str, ImageSpec]) -> dict[str, ImageSpec]:
-        """Return the declarations of the crops.
-
-        Raises:
-            ConfigError: an image is not larger than its crop.
-        """
+        """Return the declarations of the crops; `ConfigError` if an image is not larger than its
+        crop."""
         return cropped_images(images, self.size)
 
     def acting(self, images: Iterable[str]) -> list[Transform]:

@@ -111,11 +111,7 @@ def map_pairs(
 
 
 def require_known_frames(images: Mapping[str, ImageSpec]) -> None:
-    """Refuse images for which no transformation is defined.
-
-    Raises:
-        ValueError: an image has the frame "camera".
-    """
+    """Raise `ValueError` for an image whose frame is "camera", for which no rotation is defined."""
     unknown = [key for key, image in images.items() if image.frame == "camera"]
     if unknown:
         raise ValueError(
@@ -147,11 +143,7 @@ class SeededTransform(Transform):
         )
 
     def _copied(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return a copy of transitions, whose entries can be replaced.
-
-        Raises:
-            ConfigError: they are not a batch [B].
-        """
+        """Return a copy of transitions [B], whose entries can be replaced."""
         if tensordict.ndim != 1:
             raise ConfigError(
                 f"{type(self).__name__} takes a batch of transitions [B], not "

@@ -67,9 +67,6 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
     def add(self, data: TensorDictBase) -> Tensor:
         """Store one transition.
 
-        Args:
-            data: a transition without batch shape.
-
         Returns:
             Its index [1], or an empty tensor [0] for a fault.
 

@@ -39,9 +39,6 @@ class ImageCodec(Protocol):
 def make_codecs(images: Mapping[str, ImageSpec]) -> dict[str, ImageCodec]:
     """Return the codec that each image's declaration specifies, by key.
 
-    Args:
-        images: declarations by key.
-
     Raises:
         ValueError: an image has values that its storage cannot represent.
     """

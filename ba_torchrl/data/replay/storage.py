@@ -271,9 +271,6 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
     def column(self, key: NestedKey) -> Tensor:
         """Return a view of one entry of all stored transitions; images have no column.
 
-        Args:
-            key: of the entry.
-
         Raises:
             KeyError: the entry is not stored.
         """

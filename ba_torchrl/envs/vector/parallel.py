@@ -90,11 +90,7 @@ class VectorEnv(Vector):
         return [worker.process.pid for worker in self._workers]
 
     def start(self) -> None:
-        """Start the workers, and wait until all environments are made.
-
-        Raises:
-            RuntimeError: an environment cannot be made, or a worker failed too often.
-        """
+        """Start the workers, and wait until all environments are made."""
         outputs = _zeros(self.full_observation_spec, self.full_reward_spec, self.full_done_spec)
         specs = self.observation_spec.items(True, True)
         names = [key for key, spec in specs if isinstance(spec[0], NonTensor)]

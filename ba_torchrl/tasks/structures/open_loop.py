@@ -124,11 +124,7 @@ def _grasped_width_m(piece: Piece) -> float:
 
 
 def check_has_structure(task: str) -> None:
-    """Check that a task has a structure that can be taken apart.
-
-    Raises:
-        ConfigError: it has none.
-    """
+    """Raise `ConfigError` unless a task has a structure that can be taken apart."""
     if not issubclass(TASKS[task], StructureTask):
         possible = ", ".join(name for name in TASKS if issubclass(TASKS[name], StructureTask))
         raise ConfigError(f"deconstruction has no meaning for {task}; it is for {possible}")

@@ -139,9 +139,6 @@ class Terrain(ABC):
             draw_yaw: returns a random yaw of a body.
             base: one of the bodies, on which a structure can stand. It starts in the build area if
                 structures can only stand in a part of the ground.
-
-        Raises:
-            PlacementError: no layout was found.
         """
         points = random_points(self.spawn_area, rng, spacings)
         for body, xy in zip(bodies, points, strict=True):

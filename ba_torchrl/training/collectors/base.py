@@ -79,14 +79,7 @@ class CollectorConfig(StrictModel, ABC):
     """Fields that do not affect learning; a resumed run may have other values."""
 
     def check(self, num_envs: int) -> None:
-        """Check that the collector can be used, before anything starts.
-
-        Args:
-            num_envs: number of environments of the run.
-
-        Raises:
-            ConfigError: it cannot; the message names the reason.
-        """
+        """Raise `ConfigError` unless the collector can be used, before anything starts."""
         return
 
     @abstractmethod

@@ -61,12 +61,6 @@ class MultiCollection(WorkerCollection):
 
     If a worker process ends, all are replaced, and their episodes in progress are lost. An error of
     the code in a worker, such as that of a task, is raised instead.
-
-    Args:
-        problem: the run's environments and policy.
-        config: number of workers and size of batches.
-        collector_class: TorchRL's collector.
-        frames: number of transitions in a batch.
     """
 
     def __init__(

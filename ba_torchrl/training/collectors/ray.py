@@ -47,11 +47,7 @@ class RayConfig(WorkersConfig):
     cluster of this machine if it is not part of one."""
 
     def check(self, num_envs: int) -> None:
-        """Check that Ray is installed and that the workers can share the environments equally.
-
-        Raises:
-            ConfigError: it is not, or they cannot.
-        """
+        """Check that Ray is installed, and what `WorkersConfig` checks."""
         super().check(num_envs)
         check_installed("collector")
 
@@ -111,9 +107,6 @@ class _RestartingCollector(RayCollector):
     """TorchRL's collector, with workers that Ray restarts and that receive weights as objects.
 
     TorchRL sends weights through a process group, which a restarted worker cannot join.
-
-    Args:
-        collection: whose weights the workers receive.
     """
 
     def __init__(self, collection: RayCollection) -> None:

@@ -71,11 +71,7 @@ class WorkersConfig(CollectorConfig):
     """Steps of each environment between two deliveries of transitions and of weights."""
 
     def check(self, num_envs: int) -> None:
-        """Check that the workers can share the environments equally.
-
-        Raises:
-            ConfigError: they cannot.
-        """
+        """Raise `ConfigError` unless the workers can share the environments equally."""
         if num_envs % self.workers:
             raise ConfigError(
                 f"collector.workers: {self.workers} workers cannot share num_envs={num_envs} "
@@ -89,10 +85,6 @@ class WorkerCollection(Collection):
     `scalars` holds ``restarts``, the number of times that workers were replaced, and ``lag``, the
     mean number of updates between the weights that chose the actions of the last batch and the
     batch's arrival.
-
-    Args:
-        problem: the run's environments and policy.
-        config: number of workers and size of batches.
     """
 
     def __init__(self, problem: CollectionProblem, config: WorkersConfig) -> None:
@@ -114,11 +106,7 @@ class WorkerCollection(Collection):
 
     @abstractmethod
     def collect(self) -> TensorDict:
-        """Send the weights of `policy`, and return the transitions of one batch.
-
-        Raises:
-            RuntimeError: workers failed too often in a row.
-        """
+        """Send the weights of `policy`, and return the transitions of one batch."""
 
     def weights(self) -> TensorDict:
         """Return a copy of the weights and their version, on the CPU."""

@@ -104,11 +104,7 @@ def run_all(
 
 
 def unfinished(runs: Sequence[ExperimentConfig]) -> list[ExperimentConfig]:
-    """Return the runs to start: those that are not finished and that no other process runs.
-
-    Raises:
-        ConfigError: a folder holds a run with other settings.
-    """
+    """Return the runs to start: those that are not finished and that no other process runs."""
     states = [(run, status(run)) for run in runs]
     for run, found in states:
         if found.state == "running":

@@ -98,10 +98,6 @@ Grid = TypeVar("Grid", bound=BenchmarkConfig)
 def split(values: Mapping[str, Any], model: type[Grid]) -> tuple[Grid, dict[str, Any]]:
     """Return the grid that composed settings describe, and the fields that its runs share.
 
-    Args:
-        values: fields of ``model`` and of `ExperimentConfig`.
-        model: of the grid.
-
     Raises:
         ConfigError: a field of the grid has a wrong type or is out of range.
     """
@@ -209,11 +205,7 @@ def expand(
 
 
 def status(run: ExperimentConfig) -> Status:
-    """Return the state of a run. One whose files are damaged has failed.
-
-    Raises:
-        ConfigError: its folder holds a run with other settings.
-    """
+    """Return the state of a run. One whose files are damaged has failed."""
     from ba_torchrl.training.checkpoint import (
         check_same_run,
         lock_holder,

@@ -17,14 +17,7 @@ def main() -> None:
 
 
 def run_experiment(values: str) -> None:
-    """Run an experiment in this process.
-
-    Args:
-        values: its configuration, as JSON.
-
-    Raises:
-        RunStopped: SIGINT or SIGTERM was received, and the state is saved.
-    """
+    """Run an experiment in this process."""
     import json
     import logging
 

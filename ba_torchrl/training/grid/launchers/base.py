@@ -30,14 +30,7 @@ class LauncherConfig(StrictModel, ABC):
     """Options of a launcher."""
 
     def check(self, runs: Sequence[ExperimentConfig]) -> None:
-        """Check that the launcher can be used, before anything starts.
-
-        Args:
-            runs: of the grid.
-
-        Raises:
-            ConfigError: it cannot; the message names the reason.
-        """
+        """Raise `ConfigError` unless the launcher can be used, before anything starts."""
         return
 
     @abstractmethod
@@ -46,10 +39,6 @@ class LauncherConfig(StrictModel, ABC):
 
         Returns:
             By run folder, the reason of its failure. Runs that another process runs are left to it.
-
-        Raises:
-            ConfigError: a folder holds a run with other settings, in which case nothing was
-                started.
         """
 
 

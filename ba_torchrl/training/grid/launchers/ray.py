@@ -49,11 +49,7 @@ class RayConfig(LauncherConfig):
     cluster of this machine if it is not part of one."""
 
     def check(self, runs: Sequence[ExperimentConfig]) -> None:
-        """Check that Ray is installed, and that no run starts workers of its own on the cluster.
-
-        Raises:
-            ConfigError: it is not, or one does.
-        """
+        """Check that Ray is installed, and that no run starts workers of its own on the cluster."""
         check_installed("launcher")
         if any(run.collector["name"] == "ray" for run in runs):
             raise ConfigError(
@@ -112,15 +108,7 @@ def _reason(reference: Any) -> str | None:
 
 
 def _run_in_task(values: str, max_hours: float | None) -> None:
-    """Run an experiment in this process, with the run folder's log file.
-
-    Args:
-        values: the configuration of the run, as JSON.
-        max_hours: time limit of the run.
-
-    Raises:
-        TimeoutError: it took longer, or was cancelled. Its state is saved.
-    """
+    """Run an experiment in this process, with the run folder's log file."""
     folder = Path(ExperimentConfig.model_validate_json(values).run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     handler = logging.FileHandler(folder / LOG_FILE)
