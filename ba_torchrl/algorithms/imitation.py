@@ -21,7 +21,7 @@ from torchrl.objectives import LossModule
 
 from ba_torchrl.algorithms.base import ALGORITHMS, Control, Learner, LearnerConfig, Problem, SeedUse
 from ba_torchrl.algorithms.parts.replay import Uniform
-from ba_torchrl.algorithms.parts.rotation import NoRotation, RigidRotation
+from ba_torchrl.algorithms.parts.rotation import AnyRotation, NoRotation, Sampled
 from ba_torchrl.algorithms.spatial_actions import (
     demonstration_on_grid,
     make_spatial_values,
@@ -46,17 +46,19 @@ class ImitationConfig(LearnerConfig):
 
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop", "open_loop"})
 
-    rotation: RigidRotation = NoRotation()
-    """Rigid transforms of sampled open-loop transitions."""
+    rotation: AnyRotation = NoRotation()
+    """Of sampled transitions: about the z axis in close loop, rigid transforms in open loop."""
     replay: Uniform = Uniform()
 
     def check(self, network: NetworkConfig, control: Control) -> None:
-        """As for `LearnerConfig`; rigid transforms in close loop are refused too."""
+        """As for `LearnerConfig`; a rotation of the other control is refused too."""
         super().check(network, control)
-        if control == "close_loop" and self.rotation.name != "none":
+        own = isinstance(self.rotation, Sampled) == (control == "close_loop")
+        if not own and self.rotation.name != "none":
+            other = "open_loop" if control == "close_loop" else "close_loop"
             raise ConfigError(
-                f"algorithm.rotation.name: {self.rotation.name!r} transforms open_loop "
-                "transitions; leave it at 'none' for close_loop tasks"
+                f"algorithm.rotation.name: {self.rotation.name!r} transforms {other} "
+                f"transitions; leave it at 'none' for {control} tasks"
             )
 
 
@@ -130,12 +132,11 @@ class BC(Learner):
         return loss
 
     def make_transforms(self) -> list[Transform]:
-        """Return the rigid transforms of sampled open-loop transitions."""
+        """Return the rotation or the rigid transforms of sampled transitions."""
+        rotation = self.config.rotation
         if self.actions is None:
-            return []
-        return self.config.rotation.build(
-            self.problem, self.images, self.actions, keys.TARGET_ACTION
-        )
+            return rotation.build(self.problem, self.images, self.vectors)
+        return rotation.build(self.problem, self.images, self.actions, keys.TARGET_ACTION)
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the policy can choose."""

@@ -67,6 +67,29 @@ def test_the_imitated_action_is_transformed_with_the_scene(algorithm):
     assert any(tuple(place) not in stored for place in shown.tolist())
 
 
+@pytest.mark.parametrize("algorithm", ["bc", "dagger"])
+def test_the_imitated_displacement_is_rotated_with_the_image(algorithm):
+    """The images show a spot in the direction of the imitated displacement."""
+    rotation = {"name": "sampled", "probability": 1.0}
+    learner = build(algorithm, "cnn", rotation=rotation, batch_size=16)
+    data = transitions(learner)
+    angle = torch.arange(len(data)) * 0.2
+    data[keys.TARGET_ACTION][:, 1:3] = 0.5 * torch.stack([angle.cos(), angle.sin()], dim=1)
+    size = data[keys.DEPTH].shape[-1]
+    rows, columns = (size / 2 + 20 * torch.stack([angle.cos(), angle.sin()])).long()
+    data[keys.DEPTH] = torch.zeros_like(data[keys.DEPTH])
+    data[keys.DEPTH][torch.arange(len(data)), 0, rows, columns] = 1.0
+    learner.extend(data)
+    batch = learner.sample()
+    spots = batch[keys.DEPTH].flatten(1).argmax(dim=1)
+    shown = torch.stack([spots // size, spots % size], dim=1) + 0.5 - size / 2
+    imitated = batch[keys.TARGET_ACTION][:, 1:3]
+    assert (torch.cosine_similarity(shown, imitated) > 0.99).all()
+    torch.testing.assert_close(imitated.norm(dim=1), torch.full((16,), 0.5))
+    found = torch.atan2(imitated[:, 1], imitated[:, 0]) % (2 * torch.pi)
+    assert ((found[:, None] - angle).abs().amin(dim=1) > 0.01).any()
+
+
 def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     init = {"name": "bc", "updates": 30}
     algorithm = {"name": "sac", "init": init, "replay": {"name": "prioritized"}}
@@ -216,6 +239,7 @@ def demonstration_error(learner):
         ("cnn", {"name": "bc", "replay": {"name": "prioritized"}}, {}, "replay"),
         ("asr", {"name": "bc"}, {}, "network 'asr' is for open_loop"),
         ("cnn", {"name": "dagger", "rotation": {"name": "cn"}}, {}, "rotation.name: 'cn'"),
+        ("asr", {"name": "bc", "rotation": {"name": "sampled"}}, OPEN, "rotation.name: 'sampled'"),
     ],
 )
 def test_what_cannot_run_is_refused(tmp_path, network, algorithm, changes, message):

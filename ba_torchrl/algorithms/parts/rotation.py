@@ -113,3 +113,4 @@ class Cn(Rigid):
 
 
 RigidRotation = Annotated[NoRotation | Rigid | Cn, Field(discriminator="name")]
+AnyRotation = Annotated[NoRotation | Sampled | Rigid | Cn, Field(discriminator="name")]
