@@ -24,12 +24,15 @@ from torchrl.weight_update import MultiProcessWeightSyncScheme
 from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.envs.vector.worker import SentError, end_with, is_of_code
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
-from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig
+from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig, failed_too_often
 
 logger = logging.getLogger(__name__)
 
 _SHUTDOWN_S = 2.0
 _HEALTH_CHECK_S = 0.5
+# ValueError: TorchRL closes the other processes, which ignore its SIGTERM
+_OF_WORKERS = (RuntimeError, OSError, EOFError, ValueError)
+"""Errors of TorchRL's collector when a worker ends or does not start."""
 
 
 @COLLECTORS.register("multi_sync")
@@ -85,13 +88,13 @@ class MultiCollection(WorkerCollection):
 
     def collect(self) -> TensorDict:
         """Send the weights and return a batch; see `WorkerCollection.collect`."""
+        weights = self.weights()
         while True:
             try:
                 with _killed_after(self._patience_s, lambda: self._collector.procs):
-                    self._collector.update_policy_weights_(self.weights())
+                    self._collector.update_policy_weights_(weights)
                     batch = next(self._batches)
-            # ValueError: TorchRL closes the other processes, which ignore its SIGTERM
-            except (RuntimeError, OSError, EOFError, ValueError) as error:
+            except _OF_WORKERS as error:
                 self._replace(error)
                 continue
             self._failures_in_a_row = 0
@@ -144,7 +147,7 @@ class MultiCollection(WorkerCollection):
         """Replace the workers after a failure.
 
         Raises:
-            RuntimeError: there were too many in a row.
+            RuntimeError: there were too many in a row, with those at the start of new workers.
             Exception: a worker sent it.
         """
         self.close()
@@ -152,15 +155,15 @@ class MultiCollection(WorkerCollection):
             raise self._errors.get().received()
         self._failures_in_a_row += 1
         if self._failures_in_a_row > self.problem.workers.max_restarts:
-            raise RuntimeError(
-                f"the collector's workers failed {self._failures_in_a_row} times in a row; the "
-                f"last time: {cause}. Raise max_restarts, or use collector=single to see the error "
-                "where it happens"
-            ) from cause
+            raise failed_too_often(self._failures_in_a_row, cause) from cause
         self._restarts += 1
         self.scalars["restarts"] = self._restarts
         logger.warning("workers are replaced (restart %d): %s", self._restarts, cause)
-        self._collector = self._start()
+        try:
+            self._collector = self._start()
+        except _OF_WORKERS as error:
+            self._replace(error)
+            return
         self._batches = iter(self._collector)
 
 

@@ -18,7 +18,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
-from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig
+from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig, failed_too_often
 from ba_torchrl.training.ray_cluster import (
     check_installed,
     check_resources,
@@ -33,7 +33,8 @@ _FOREVER = sys.maxsize
 class RayConfig(WorkersConfig):
     """Workers of a Ray cluster, each a Ray actor; they do not wait for each other.
 
-    Ray starts a worker of a machine that fails again on another one that has the resources.
+    Ray starts a worker that fails again, on another machine if its own has failed, at most
+    ``max_restarts`` times for one batch; a worker that fails before its first batch is not counted.
     """
 
     resources: ClassVar[frozenset[str]] = frozenset({"workers", "cpus", "gpus", "address"})
@@ -86,7 +87,11 @@ class RayCollection(WorkerCollection):
 
     def collect(self) -> TensorDict:
         """Send the weights and return a batch; see `WorkerCollection.collect`."""
-        return next(self._batches)
+        try:
+            return next(self._batches)
+        except ray_module().exceptions.RayActorError as error:
+            failures = self.problem.workers.max_restarts + 1
+            raise failed_too_often(failures, error) from error
 
     def close(self) -> None:
         """End the workers."""
@@ -125,7 +130,7 @@ class _RestartingCollector(RayCollector):
                 "num_cpus": config.cpus,
                 "num_gpus": config.gpus,
                 "max_restarts": -1,
-                "max_task_retries": -1,
+                "max_task_retries": problem.workers.max_restarts,  # of each batch, and of weights
             },
             weight_sync_schemes={},
             update_after_each_batch=True,

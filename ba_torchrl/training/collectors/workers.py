@@ -150,6 +150,14 @@ class WorkerCollection(Collection):
         return seed if attempt == 0 else derive_seed(seed, SeedUse.COLLECTION, attempt)
 
 
+def failed_too_often(failures: int, cause: Exception) -> RuntimeError:
+    """Return the error of workers that failed more than ``max_restarts`` times in a row."""
+    return RuntimeError(
+        f"the collector's workers failed {failures} times in a row; the last time: {cause}. Raise "
+        "max_restarts, or use collector=single to see the error where it happens"
+    )
+
+
 def _make_policy(
     make: Callable[[int], TensorDictModuleBase], seed: int, first_env: int
 ) -> VersionedPolicy:

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import time
+from unittest.mock import Mock
 
 import pytest
 import torch
@@ -172,6 +173,56 @@ def test_workers_that_hang_at_their_start_are_killed(collecting, monkeypatch):
     with pytest.raises((RuntimeError, OSError)):
         collecting("multi_sync", start_timeout_s=1.0, timeout_s=1.0)
     assert not multiprocessing.active_children()
+
+
+class FailingCollector:
+    """A collector without processes; the second and the third one do not start, and the
+    first one loses its workers."""
+
+    procs = ()
+    count = 0
+
+    def __init__(self, *_, **__):
+        type(self).count += 1
+        if self.count in (2, 3):
+            raise RuntimeError("no start")
+
+    def __iter__(self):
+        if self.count == 1:
+            raise EOFError
+        yield "batch"
+
+    def update_policy_weights_(self, weights):
+        assert weights is not None
+
+    def shutdown(self, **_):
+        pass
+
+
+@pytest.mark.parametrize(("max_restarts", "starts"), [(3, 4), (2, 3)])
+def test_a_start_that_fails_is_a_failure_in_a_row(max_restarts, starts, tmp_path, monkeypatch):
+    monkeypatch.setattr(FailingCollector, "count", 0)
+    monkeypatch.setattr(multi, "MultiSyncCollector", FailingCollector)
+    collector = {"name": "multi_sync", "workers": 2}
+    collection, _ = start(config_for(tmp_path, collector, max_restarts=max_restarts))
+    if starts == 4:
+        assert collection.collect() == "batch"
+    else:
+        with pytest.raises(RuntimeError, match="failed 3 times in a row; the last time: no start"):
+            collection.collect()
+    assert FailingCollector.count == starts
+    collection.close()
+
+
+def test_an_error_of_the_learners_weights_is_not_one_of_the_workers(tmp_path, monkeypatch):
+    monkeypatch.setattr(FailingCollector, "count", 0)
+    monkeypatch.setattr(multi, "MultiSyncCollector", FailingCollector)
+    collection, _ = start(config_for(tmp_path, {"name": "multi_sync", "workers": 2}))
+    monkeypatch.setattr(collection, "weights", Mock(side_effect=RuntimeError("no memory")))
+    with pytest.raises(RuntimeError, match="^no memory$"):
+        collection.collect()
+    assert collection.scalars["restarts"] == 0
+    collection.close()
 
 
 def test_too_many_failures_in_a_row_end_the_collection(collecting):
