@@ -143,6 +143,7 @@ def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
     ("words", "part", "options"),
     [
         (["algorithm.imitation.name=none"], "imitation", {"name": "none"}),
+        (["algorithm.imitation={name: none}"], "imitation", {"name": "none"}),
         (
             ["algorithm.imitation.name=successes", "algorithm.imitation.weight=2.0"],
             "imitation",
@@ -154,6 +155,7 @@ def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
             {"name": "shift", "pixels": 4, "views": 1, "target_views": 1},
         ),
         (["algorithm.imitation.name=none", "algorithm.imitation.weight=2"], "imitation", None),
+        (["algorithm.imitation={name: none, weight: 2}"], "imitation", None),
     ],
 )
 def test_a_part_that_replaces_that_of_a_preset_keeps_the_values_that_it_has(words, part, options):

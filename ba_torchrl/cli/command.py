@@ -29,6 +29,7 @@ from ba_torchrl.core.config import parse
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import has_entry_points, load_plugins
 from ba_torchrl.record.logging import limit_library_logs
+from ba_torchrl.record.results import flat
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 
@@ -55,6 +56,14 @@ class Arguments:
     def names(self) -> set[str]:
         """The settings that are given, such as ``env.obs_size``."""
         return {override.split("=")[0].lstrip("+~") for override in self.overrides}
+
+    @property
+    def fields(self) -> set[str]:
+        """The same, with the fields of one that is given in braces, such as ``algorithm.init.name``
+        for ``algorithm.init={name: bc}``; Hydra has read the settings."""
+        parsed = OverridesParser.create().parse_overrides(self.overrides)
+        values = {each.key_or_group: each.value() for each in parsed}
+        return self.names | flat(values).keys()
 
 
 @dataclass(frozen=True)

@@ -31,7 +31,7 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
 
     if is_resumed and arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
         return read_config(values["run_dir"], **{name: values[name] for name in arguments.names})
-    return ExperimentConfig.parse(values, given=arguments.names)
+    return ExperimentConfig.parse(values, given=arguments.fields)
 
 
 def main(config: ExperimentConfig) -> None:
