@@ -35,6 +35,7 @@ from ba_torchrl.algorithms.parts.views import NoViews, Views
 from ba_torchrl.core import keys
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.transitions import WITH_TARGET, Imitation
+from ba_torchrl.demonstrations.episodes import is_success
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
 from ba_torchrl.objectives.sacfd import SACfDLoss, SoftUpdateByNetwork
@@ -237,13 +238,18 @@ class SAC(Learner):
         """Store collected steps; if successes are imitated, the episodes that have ended, of which
         those that succeed count as demonstrations."""
         if self.episodes is None:
-            return super().on_collected(data)
-        data = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
-        new = self.entries_per_transition * int(data[keys.IS_EXPERT].sum())
-        stored = self.replay.num_demonstrations + new
-        if stored > self.config.replay.capacity // 2:  # demonstrations are never overwritten
-            data[keys.IS_EXPERT] = torch.zeros_like(data[keys.IS_EXPERT])
-        return self.on_demonstrations([data])
+            super().on_collected(data)
+            return
+        ended = self.episodes.complete(data.exclude(keys.EXPERT_ACTION))  # imitates what it did
+        left = self.config.replay.capacity // 2 - self.replay.num_demonstrations
+        stored = []
+        for episode in ended:
+            new = self.entries_per_transition * len(episode)
+            imitates = is_success(episode) and new <= left  # demonstrations are never overwritten
+            left -= new * imitates
+            stored.append(self.to_transitions(episode, is_demonstration=imitates))
+        if stored:
+            self.extend(torch.cat(stored))
 
     def replay_state(self) -> dict[str, Any]:
         """Return the state of the replay and, if successes are imitated, the transitions of

@@ -205,7 +205,7 @@ def mean_return(episodes: Sequence[TensorDictBase]) -> float:
 
 
 class EpisodeAssembler:
-    """Holds transitions back until their episodes end, and flags those of successful episodes.
+    """Holds transitions back until their episodes end.
 
     Where the next step of an episode is missing, as after the replacement of a worker, the part
     before counts as an unsuccessful episode, and the part after as another episode.
@@ -218,16 +218,12 @@ class EpisodeAssembler:
         """Number of transitions of the episodes that have not ended."""
         return sum(map(len, self._running.values()))
 
-    def complete(self, data: TensorDictBase) -> TensorDictBase:
-        """Add transitions, and return those of the episodes that have ended.
+    def complete(self, data: TensorDictBase) -> list[TensorDictBase]:
+        """Add transitions, and return the episodes [T] that have ended, in that order.
 
         Args:
             data: [N], those of an environment in their order, with ``env_index``, ``step_count``
-                and, under "next", ``done`` and ``success``.
-
-        Returns:
-            [M] transitions in the order in which their episodes ended, with ``is_expert`` set
-            where the episode was successful.
+                and, under "next", ``done``.
         """
         ended = []
         for row in range(len(data)):
@@ -235,24 +231,12 @@ class EpisodeAssembler:
             index = int(transition[keys.ENV_INDEX])
             running = self._running.setdefault(index, [])
             if running and transition[keys.STEP_COUNT] != running[-1][keys.STEP_COUNT] + 1:
-                ended.append(self._flagged(index, is_successful=False))
-                running = self._running.setdefault(index, [])
+                ended.append(torch.cat(running))
+                running = self._running[index] = []
             running.append(transition)
             if bool(transition[keys.NEXT, keys.DONE]):
-                is_successful = bool(transition[keys.NEXT, keys.SUCCESS])
-                ended.append(self._flagged(index, is_successful=is_successful))
-        if ended:
-            return torch.cat(ended)
-        return (
-            data[:0].clone().set(keys.IS_EXPERT, torch.zeros(0, 1, dtype=torch.bool, device="cpu"))
-        )
-
-    def _flagged(self, index: int, *, is_successful: bool) -> TensorDictBase:
-        """Return an environment's episode, which has ended, with its flag."""
-        episode = torch.cat(self._running.pop(index))
-        return episode.set(
-            keys.IS_EXPERT, torch.full((len(episode), 1), is_successful, device="cpu")
-        )
+                ended.append(torch.cat(self._running.pop(index)))
+        return ended
 
     def state_dict(self) -> dict[str, Any]:
         """Return the transitions of the episodes that have not ended, by environment."""

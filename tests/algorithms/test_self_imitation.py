@@ -1,5 +1,7 @@
 """Collected episodes that succeed as demonstrations."""
 
+from unittest.mock import Mock
+
 import pytest
 import torch
 
@@ -59,6 +61,14 @@ def test_successes_fill_at_most_half_of_the_replay(replay):
         learner.on_collected(data)
         assert learner.replay.num_demonstrations == min(stored, 4)
         assert len(learner.replay) == min(stored, 8)
+
+
+def test_collected_episodes_are_not_processed_as_those_before_the_first_update():
+    learner = build("sac", imitation=SUCCESSES, batch_size=4)
+    learner.on_demonstrations = Mock()
+    learner.on_collected(collected(learner, [True, True], [True, False]))
+    learner.on_demonstrations.assert_not_called()
+    assert learner.replay.storage[:][keys.IS_DEMONSTRATION][:, 0].tolist() == [True, False]
 
 
 def test_without_the_option_transitions_are_stored_at_once():

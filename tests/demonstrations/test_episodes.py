@@ -11,6 +11,7 @@ from ba_torchrl.demonstrations.episodes import (
     RESULT_KEYS,
     EpisodeAssembler,
     collect_episodes,
+    is_success,
     mean_length,
     quotas,
     success_rate,
@@ -138,19 +139,20 @@ def rows(*transitions):
     )
 
 
-def values(data):
-    return data["value"].flatten().tolist(), data[keys.IS_EXPERT].flatten().tolist()
+def values(episodes):
+    """The values of the steps of each episode, and whether it succeeds."""
+    return [(each["value"].flatten().tolist(), is_success(each)) for each in episodes]
 
 
 def test_transitions_are_returned_when_their_episode_ends():
     episodes = EpisodeAssembler()
-    assert values(episodes.complete(rows((0, 0, False, False), (1, 0, False, False)))) == ([], [])
+    assert values(episodes.complete(rows((0, 0, False, False), (1, 0, False, False)))) == []
     found = episodes.complete(rows((0, 1, False, False), (1, 1, True, True)))
-    assert values(found) == ([10, 11], [True, True])
-    assert torch.equal(found[keys.NEXT, "value"], found["value"] + 1)
+    assert values(found) == [([10, 11], True)]
+    assert found[0][keys.NEXT, "value"].flatten().tolist() == [11, 12]
     assert len(episodes) == 2
     found = episodes.complete(rows((0, 2, True, False), (1, 0, True, True)))
-    assert values(found) == ([0, 1, 2, 10], [False] * 3 + [True])
+    assert values(found) == [([0, 1, 2], False), ([10], True)]
     assert len(episodes) == 0
 
 
@@ -159,14 +161,14 @@ def test_an_episode_that_is_cut_off_by_another_one_is_unsuccessful():
     episodes.complete(rows((3, 0, False, False)))
     episodes.complete(rows((3, 1, False, False)))
     found = episodes.complete(rows((3, 0, True, True)))
-    assert values(found) == ([30, 31, 30], [False, False, True])
+    assert values(found) == [([30, 31], False), ([30], True)]
 
 
 def test_an_episode_whose_next_step_is_missing_is_unsuccessful():
     episodes = EpisodeAssembler()
     episodes.complete(rows((0, 0, False, False), (0, 1, False, False)))
     found = episodes.complete(rows((0, 5, False, False), (0, 6, True, True)))
-    assert values(found) == ([0, 1, 5, 6], [False, False, True, True])
+    assert values(found) == [([0, 1], False), ([5, 6], True)]
 
 
 def test_a_batch_can_hold_several_steps_of_an_environment():
@@ -174,7 +176,7 @@ def test_a_batch_can_hold_several_steps_of_an_environment():
     found = episodes.complete(
         rows((0, 0, False, False), (0, 1, True, True), (0, 0, False, False), (1, 0, True, False))
     )
-    assert values(found) == ([0, 1, 10], [True, True, False])
+    assert values(found) == [([0, 1], True), ([10], False)]
     assert len(episodes) == 1
 
 
@@ -185,7 +187,6 @@ def test_a_restored_state_continues_the_episodes():
     assert len(second) == 2
     data = rows((2, 1, True, True), (0, 1, False, False))
     for assembler in (first, second):
-        assert values(assembler.complete(data)) == ([20, 21], [True, True])
-    assert (
-        first.complete(rows((0, 2, True, False))) == second.complete(rows((0, 2, True, False)))
-    ).all()
+        assert values(assembler.complete(data)) == [([20, 21], True)]
+    (one,), (other,) = (each.complete(rows((0, 2, True, False))) for each in (first, second))
+    assert (one == other).all()
