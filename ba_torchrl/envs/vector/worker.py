@@ -6,6 +6,8 @@ import ctypes
 import os
 import pickle
 import signal
+import socket
+import struct
 import sys
 import threading
 import time
@@ -96,6 +98,7 @@ class Worker:
     def __init__(self, make_env: MakeEnv, slot: Slot, options: WorkerOptions) -> None:
         context = mp.get_context(options.start_method)
         self.pipe, child_pipe = context.Pipe()
+        _limit_sending(self.pipe, options.timeout_s)
         self.process = context.Process(
             # A function that cannot be imported is met first, so that the pipe is open until the
             # process has ended.
@@ -136,10 +139,15 @@ class Worker:
         return self.pipe, self.process.sentinel
 
     def send(self, command: str, arguments: tuple[Any, ...], keywords: dict[str, Any]) -> None:
-        """Send a command; if the process has ended, `receive` raises."""
-        with suppress(OSError):
+        """Send a command; if the process has ended, `receive` raises. One that does not take the
+        command within ``timeout_s`` seconds, since its pipe is full, is killed."""
+        try:
             # Not `send`, which passes tensors as file descriptors that an ended worker never opens.
             self.pipe.send_bytes(pickle.dumps((command, arguments, keywords)))
+        except BlockingIOError:
+            self.abort()
+        except OSError:
+            pass
 
     def has_answer(self) -> bool:
         """Whether `receive` returns or raises at once."""
@@ -277,6 +285,13 @@ def _run(
             except BaseException as error:  # the parent raises it
                 answer = pickle.dumps(SentError.of(error))
             pipe.send_bytes(answer)
+
+
+def _limit_sending(pipe: Connection, seconds: float) -> None:
+    """Let `send_bytes` raise BlockingIOError when a full pipe takes nothing for some time."""
+    timeval = struct.pack("ll", int(seconds), int(seconds % 1 * 1e6))
+    with socket.socket(fileno=os.dup(pipe.fileno())) as same:  # a pipe of two directions is one
+        same.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeval)
 
 
 def _kill(process: BaseProcess) -> None:

@@ -11,7 +11,7 @@ import torch
 from fake_env import FakeEnv, act, assert_lost, assert_stepped
 
 from ba_torchrl.core.config import WorkerOptions
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError, WorkerError
 from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.parallel import VectorEnv
 
@@ -97,6 +97,18 @@ class TestFailures:
         result = env.step(act(env, state.clone()))
         for index in (0, 1):
             assert_stepped(result, index, state)
+        assert env.restarts == 1
+
+    @pytest.mark.timeout(60)
+    def test_a_stopped_worker_with_a_full_pipe_is_killed(self, make_fakes):
+        env = make_fakes(2, timeout_s=0.5)
+        env.reset()
+        worker = env._workers[1]
+        os.kill(worker.process.pid, signal.SIGSTOP)
+        worker.send("call", (bytes(2**22),), {})
+        with pytest.raises(WorkerError, match="its process was ended by SIGKILL"):
+            worker.receive()
+        env.reset()
         assert env.restarts == 1
 
     def test_all_at_once(self, make_fakes, tmp_path):

@@ -219,7 +219,7 @@ def test_an_error_of_the_learners_weights_is_not_one_of_the_workers(tmp_path, mo
     monkeypatch.setattr(multi, "MultiSyncCollector", FailingCollector)
     collection, _ = start(config_for(tmp_path, {"name": "multi_sync", "workers": 2}))
     monkeypatch.setattr(collection, "weights", Mock(side_effect=RuntimeError("no memory")))
-    with pytest.raises(RuntimeError, match="^no memory$"):
+    with pytest.raises(RuntimeError, match=r"^no memory$"):
         collection.collect()
     assert collection.scalars["restarts"] == 0
     collection.close()
