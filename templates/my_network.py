@@ -6,8 +6,7 @@ import torch
 import torch.nn.functional as F
 from torch import nn
 
-from ba_torchrl.core.config import StrictModel
-from ba_torchrl.modules.base import NETWORKS, ActorCritic
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
 
 
 class Features(nn.Module):
@@ -70,7 +69,7 @@ class Critic(nn.Module):
 
 
 @NETWORKS.register("mine/my_network")
-class MyNetworkConfig(StrictModel):
+class MyNetworkConfig(NetworkConfig):
     """Hyper-parameters, which the command line sets: ``network.width=64``."""
 
     control: ClassVar[str] = "close_loop"

@@ -99,7 +99,7 @@ class Learner(ABC):
             acting, self.make_acting_transforms(), self.make_exploration()
         ).to(problem.device)
         self.stages = self.make_stages()
-        self.pretraining = self.make_pretraining()
+        self.first_losses = self.make_first_losses()
         self.target_updater = self.make_target_updater()
         self.replay = self.make_replay()
         for transform in self.make_transforms():
@@ -151,14 +151,14 @@ class Learner(ABC):
         optimisers' step on the one before; by default the loss module alone."""
         return [self.loss]
 
-    def make_pretraining(self) -> list[tuple[int, LossFunction]]:
+    def make_first_losses(self) -> list[tuple[int, LossFunction]]:
         """Return numbers of first updates of a run, and the loss that each number of updates
         minimises instead of the stages; by default none."""
         return []
 
     def due_stages(self) -> Sequence[LossFunction]:
         """Return the stages of the update that follows `updates` others, unless a loss of
-        `make_pretraining` is due; by default all. An algorithm that updates its policy less often
+        `make_first_losses` is due; by default all. An algorithm that updates its policy less often
         than its critics leaves one out."""
         return self.stages
 
@@ -248,7 +248,7 @@ class Learner(ABC):
     def sample(self) -> TensorDictBase:
         """Return an augmented batch from the replay on the learner's device."""
         if self._is_prioritized:
-            first = self.config.pretraining_updates
+            first = self.config.first_updates
             own, total = (n - first for n in (self.updates, self.problem.total_updates))
             self.replay.sampler.anneal(max(own, 0) / max(total, 1))
         batch, device = self.replay.sample(), self.problem.device
@@ -264,7 +264,7 @@ class Learner(ABC):
             FloatingPointError: a loss is not finite.
         """
         batch = self.sample()
-        first = [loss for updates, loss in self.pretraining if self.updates < updates]
+        first = [loss for updates, loss in self.first_losses if self.updates < updates]
         scalars = self.minimize(batch, first or self.due_stages())
         if self._is_prioritized and keys.TD_ERROR in batch:
             errors = {key: batch[key] for key in ("index", keys.TD_ERROR)}
@@ -272,7 +272,7 @@ class Learner(ABC):
         return scalars
 
     def compile(self, mode: CompileMode) -> None:
-        """Compile the loss and its gradient, except those of `make_pretraining`; see
+        """Compile the loss and its gradient, except those of `make_first_losses`; see
         `CompiledLoss`."""
         self.stages = [CompiledLoss(self.loss, mode, stage) for stage in self.stages]
 

@@ -42,9 +42,10 @@ class LearnerConfig(StrictModel, ABC):
     """Transitions of demonstrations and collection, and how a batch is drawn."""
 
     @model_validator(mode="after")
-    def _check_halves(self) -> Self:
-        if self.replay.name == "symmetric" and self.batch_size < 2:
-            raise ValueError("batch_size must be at least 2 with a symmetric replay, half of each")
+    def _check_batch(self) -> Self:
+        if self.batch_size < self.replay.least_batch:
+            least, name = self.replay.least_batch, self.replay.name
+            raise ValueError(f"batch_size must be at least {least} with replay.name={name}")
         return self
 
     @property
@@ -54,9 +55,9 @@ class LearnerConfig(StrictModel, ABC):
         return "executed"
 
     @property
-    def pretraining_updates(self) -> int:
-        """Number of first updates of a run that minimise the losses of `Learner.make_pretraining`,
-        all on the demonstrations; by default none."""
+    def first_updates(self) -> int:
+        """Number of first updates of a run that minimise those of `Learner.make_first_losses`, all
+        on the demonstrations; by default none."""
         return 0
 
     def check(self, network: NetworkConfig, control: Control) -> None:

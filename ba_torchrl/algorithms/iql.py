@@ -67,7 +67,7 @@ class IQLConfig(LearnerConfig):
         return "none" if self.init.name == "random" else "expert"
 
     @property
-    def pretraining_updates(self) -> int:
+    def first_updates(self) -> int:
         """Those of the initialisation."""
         return self.init.updates
 
@@ -124,7 +124,7 @@ class IQL(Learner):
         loss.make_value_estimator(gamma=self.config.gamma)
         return loss
 
-    def make_pretraining(self) -> list[tuple[int, LossFunction]]:
+    def make_first_losses(self) -> list[tuple[int, LossFunction]]:
         """Return the loss of the initialisation."""
         return self.config.init.build(self.trained_policy)
 

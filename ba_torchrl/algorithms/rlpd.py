@@ -90,12 +90,12 @@ class RLPD(SAC):
     def make_scheduler(self, optimizer: Optimizer) -> LinearLR:
         """Return the schedule of the learning rate, which steps once per critic update."""
         total, config = self.problem.total_updates, self.config
-        further = (total - config.pretraining_updates) * (config.critic_updates - 1)
+        further = (total - config.first_updates) * (config.critic_updates - 1)
         return config.optimizer.schedule(optimizer, total + further)
 
     def update(self) -> TensorDict:
         """Take the critic updates, the last one together with that of policy and temperature."""
-        if self.updates >= self.config.pretraining_updates:
+        if self.updates >= self.config.first_updates:
             for _ in range(self.config.critic_updates - 1):
                 self.step(self.sample(), [self.loss.critic_loss])
         return super().update()

@@ -94,7 +94,7 @@ class SACConfig(LearnerConfig):
         return "expert"
 
     @property
-    def pretraining_updates(self) -> int:
+    def first_updates(self) -> int:
         """Those of the initialisation or, if there are more, of the contrastive loss."""
         return max(self.init.updates, self.contrastive.updates)
 
@@ -120,7 +120,7 @@ class SAC(Learner):
 
     def make_networks(self, network: NetworkConfig) -> ActorCritic:
         """Return actor, encoder and critic."""
-        if self.config.contrastive.name != "none" and not getattr(network, "shares_encoder", False):
+        if self.config.contrastive.name != "none" and not network.shares_encoder:
             name = NETWORKS.name_of(type(network))
             logger.warning("contrastive has no effect on the encoder of the policy of %r", name)
         networks = network.build(self.network_spec)
@@ -164,8 +164,7 @@ class SAC(Learner):
             entropy_backup=config.entropy_backup,
             **config.imitation.loss_options,
             **config.replay.loss_options,
-            views=config.views.views,
-            target_views=config.views.target_views,
+            **config.views.loss_options,
             contrastive=config.contrastive.build(networks.encoder, self.seen_images),
             **options,
         )
@@ -181,7 +180,7 @@ class SAC(Learner):
         contrastive = [] if self.loss.contrastive is None else [self.loss.contrastive_loss]
         return [self.loss, *contrastive]
 
-    def make_pretraining(self) -> list[tuple[int, LossFunction]]:
+    def make_first_losses(self) -> list[tuple[int, LossFunction]]:
         """Return the loss of the initialisation, and the contrastive one."""
         config = self.config
         contrastive = (config.contrastive.updates, self.loss.contrastive_loss)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import Any, ClassVar, Literal, NamedTuple
 
 from torch import nn
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
 
@@ -83,17 +85,20 @@ class ActorCritic(NamedTuple):
     specification asks for K critics."""
 
 
-class NetworkConfig(Protocol):
-    """A registered network: a pydantic model of its hyper-parameters that builds it."""
+class NetworkConfig(StrictModel, ABC):
+    """A registered network: its hyper-parameters, and how it is built."""
 
     control: ClassVar[Control]
     """Control of the tasks that it supports. ``build`` returns an `ActorCritic` for close-loop
     tasks and a `ba_torchrl.modules.spatial.base.SpatialQNetwork` for open-loop tasks."""
     image_keys: ClassVar[tuple[str, ...]]
     """Keys of its input images, in the order of its arguments; the holding flag follows."""
-    vector_keys: Sequence[str]
-    """Keys of its input vectors, which follow the holding flag."""
+    vector_keys: ClassVar[Sequence[str]]
+    """Keys of its input vectors, which follow the holding flag: a field, or of the class."""
+    shares_encoder: ClassVar[bool] = False
+    """Whether the policy sees features of the critics' encoder."""
 
+    @abstractmethod
     def build(self, spec: Any) -> Any:
         """Return freshly initialised modules.
 
@@ -104,7 +109,6 @@ class NetworkConfig(Protocol):
             ValueError: the network does not support the size or kind of an image or the components
                 of the action, or they do not fit its hyper-parameters.
         """
-        ...
 
 
 NETWORKS: Registry[type[NetworkConfig]] = Registry("network", "ba_torchrl.modules")

@@ -102,8 +102,9 @@ class ExperimentConfig(WorkerOptions):
     demonstrations_mapping: str | None = None
     """YAML file with the names of the entries in somebody else's demonstrations (docs/data.md)."""
     pretrain_updates: int = Field(default=0, ge=0)
-    """Updates on the demonstrations before the first environment step, besides those of parts of
-    the algorithm, such as ``algorithm.init.updates``."""
+    """Updates on the demonstrations before the first environment step, besides the first ones of
+    parts of the algorithm, such as ``algorithm.init.updates``. If they equal ``total_updates``, the
+    run has no environment steps, and those first ones are among them."""
     total_updates: int = Field(default=10_000, ge=1)
     """Gradient updates of the run, pretraining included; reference implementation."""
     updates_per_step: int = Field(default=1, ge=1)
@@ -233,13 +234,14 @@ class ExperimentConfig(WorkerOptions):
         control = config.resolved_env.task_class.control
         config.algorithm_config.check(config.network_config, control)
         config._check_reward()
-        own = config.algorithm_config.pretraining_updates
-        offline = own + config.pretrain_updates
-        if offline > config.total_updates:
-            others = f"{own} updates of pretraining of the algorithm and " if own else ""
+        own, further = config.algorithm_config.first_updates, config.pretrain_updates
+        total = config.total_updates
+        offline = max(own, total) if further == total else own + further
+        if offline > total:
+            others = f"{own} first updates of the algorithm and " if own else ""
             raise ConfigError(
-                f"{others}pretrain_updates ({config.pretrain_updates}) are part of total_updates "
-                f"({config.total_updates}) and cannot exceed it"
+                f"{others}pretrain_updates ({further}) are part of total_updates ({total}) and "
+                "cannot exceed it"
             )
         if offline and not config.demonstrations:
             raise ConfigError("an update before the first environment step needs demonstrations")

@@ -175,7 +175,7 @@ class Experiment:
         computed = precision(config)
         if computed not in self.state.precisions:
             self.state.precisions.append(computed)
-        first = config.algorithm_config.pretraining_updates
+        first = config.algorithm_config.first_updates
         collects = config.algorithm_config.collects
         offline = first + config.pretrain_updates if collects else config.total_updates
         self._phase_start = algorithm.updates

@@ -154,7 +154,7 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     settings = {"total_updates": 2, "eval_every": 2, **changes, "demonstrations_noise": 0.5}
     made = make_experiment(tmp_path, network, algorithm, **settings)
     learner, imitated, episodes = made.algorithm, [], []
-    first = [loss for updates, loss in learner.pretraining if updates]
+    first = [loss for updates, loss in learner.first_losses if updates]
     (loss,) = first or [learner.loss]
     key = loss.tensor_keys.action
     assert key == keys.TARGET_ACTION
@@ -235,7 +235,7 @@ def demonstration_error(learner):
     ("network", "algorithm", "changes", "message"),
     [
         ("cnn", {"name": "bc"}, {"demonstrations": 0}, "learns from demonstrations only"),
-        ("cnn", {"name": "sac", "init": {"name": "bc"}}, {}, "500 updates of pretraining"),
+        ("cnn", {"name": "sac", "init": {"name": "bc"}}, {}, "500 first updates"),
         ("cnn", {"name": "bc", "replay": {"name": "prioritized"}}, {}, "replay"),
         ("asr", {"name": "bc"}, {}, "network 'asr' is for open_loop"),
         ("cnn", {"name": "dagger", "rotation": {"name": "cn"}}, {}, "rotation.name: 'cn'"),

@@ -116,9 +116,13 @@ def test_the_policy_acts_within_the_range_and_greedily_at_its_mode():
     torch.testing.assert_close(greedy, loc.tanh())
 
 
-@pytest.mark.parametrize("pretrain_updates", [2, 1])
-def test_two_updates_offline_or_online(tmp_path, pretrain_updates):
-    learner = run(tmp_path, "cnn", {"name": "iql"}, pretrain_updates=pretrain_updates)
+@pytest.mark.parametrize(
+    ("pretrain_updates", "init"),
+    [(2, {"name": "random"}), (1, {"name": "random"}), (2, {"name": "bc", "updates": 1})],
+)
+def test_two_updates_offline_or_online(tmp_path, pretrain_updates, init):
+    algorithm = {"name": "iql", "init": init}
+    learner = run(tmp_path, "cnn", algorithm, pretrain_updates=pretrain_updates)
     is_demonstration = learner.replay.storage.column(keys.IS_DEMONSTRATION)
     assert (~is_demonstration).sum() == (0 if pretrain_updates == 2 else 2)
     assert read_scalars(tmp_path / "run")["train/env_steps"].values[-1] == (~is_demonstration).sum()

@@ -7,8 +7,7 @@ from torch import nn
 
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.algorithms.sac import SACConfig
-from ba_torchrl.core.config import StrictModel
-from ba_torchrl.modules.base import NETWORKS, ActorCritic
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
 
 
 class FlatActor(nn.Module):
@@ -43,7 +42,7 @@ def flat(depth, holding):
 
 
 @NETWORKS.register("mine/flat")
-class FlatConfig(StrictModel):
+class FlatConfig(NetworkConfig):
     """Hyper-parameters of the linear actor-critic."""
 
     control: ClassVar[str] = "close_loop"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, ClassVar, Literal
 
 import torch
 from pydantic import Field
@@ -17,6 +17,9 @@ from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
 
 
 class _Replay(Part):
+    least_batch: ClassVar[int] = 1
+    """Least number of transitions in a batch."""
+
     capacity: int = Field(default=100_000, ge=1)
     """Transitions, demonstrations and others together."""
 
@@ -79,6 +82,7 @@ class Symmetric(_Replay):
     """Half of a batch is drawn from the demonstrations and half from the other transitions."""
 
     name: Literal["symmetric"] = "symmetric"
+    least_batch: ClassVar[int] = 2
 
 
 Replay = Annotated[Uniform | Prioritized | Symmetric, Field(discriminator="name")]

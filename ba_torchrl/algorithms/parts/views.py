@@ -29,8 +29,7 @@ class NoViews(_Whole):
     """The images as they are."""
 
     name: Literal["none"] = "none"
-    views: ClassVar[int] = 1
-    target_views: ClassVar[int] = 1
+    loss_options: ClassVar[dict[str, Any]] = {}
 
     def build(self, *args: Any, **options: Any) -> list[Transform]:
         """Return no transform of sampled transitions."""
@@ -43,10 +42,14 @@ class _Random(_Whole):
     target_views: int = Field(default=1, ge=1)
     """Views of each next observation, over which the target is averaged."""
 
+    @property
+    def loss_options(self) -> dict[str, Any]:
+        """Arguments of `SACfDLoss`, and of `RandomViews`."""
+        return {"views": self.views, "target_views": self.target_views}
+
     def build(self, *args: Any, **options: Any) -> list[Transform]:
         """Return the transform of sampled transitions; arguments as for `RandomViews`."""
-        numbers = {"views": self.views, "target_views": self.target_views}
-        return [RandomViews(*args, **numbers, **options)]
+        return [RandomViews(*args, **self.loss_options, **options)]
 
 
 class Crop(_Random):

@@ -11,8 +11,13 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import StrictModel
-from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN, ActorCriticSpec, Control
+from ba_torchrl.modules.base import (
+    LOG_STD_MAX,
+    LOG_STD_MIN,
+    ActorCriticSpec,
+    Control,
+    NetworkConfig,
+)
 from ba_torchrl.modules.layers import Precision, compute_dtype
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
@@ -40,7 +45,7 @@ def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int,
     return stages if image_size == 128 else stages[1:]
 
 
-class ImageNetworkConfig(StrictModel):
+class ImageNetworkConfig(NetworkConfig):
     """Hyper-parameters that every network on depth images has.
 
     The input of the networks is (depth - depth_center_m) / depth_scale_m. The defaults keep metres,
@@ -67,8 +72,6 @@ class ImageNetworkConfig(StrictModel):
 
     control: ClassVar[Control] = "close_loop"
     image_keys: ClassVar[tuple[str, ...]] = (keys.DEPTH,)
-    shares_encoder: ClassVar[bool] = False
-    """Whether the policy sees features of the critics' encoder."""
 
     precision: Precision = "auto"
     depth_reference: Literal["camera", "floor"] = "camera"

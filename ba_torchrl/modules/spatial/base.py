@@ -15,9 +15,8 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.modules.base import Control
+from ba_torchrl.modules.base import Control, NetworkConfig
 from ba_torchrl.modules.layers import Precision, compute_dtype, scaled_width
 
 
@@ -120,7 +119,7 @@ UNET_STRIDE = 16
 """Pixels of the image per pixel of a UNet's bottleneck map; image sizes are multiples of it."""
 
 
-class SpatialImageConfig(StrictModel):
+class SpatialImageConfig(NetworkConfig):
     """Hyper-parameters of every spatial Q network.
 
     By default heights are in metres, as in the reference implementation, and a block of 3 cm hardly

@@ -5,8 +5,7 @@ from typing import ClassVar
 import torch
 from torch import nn
 
-from ba_torchrl.core.config import StrictModel
-from ba_torchrl.modules.base import NETWORKS, ActorCritic
+from ba_torchrl.modules.base import NETWORKS, ActorCritic, NetworkConfig
 
 
 class Features(nn.Module):
@@ -59,7 +58,7 @@ class Critic(nn.Module):
 
 
 @NETWORKS.register("mine/two_views")
-class TwoViewsConfig(StrictModel):
+class TwoViewsConfig(NetworkConfig):
     """Hyper-parameters of the network."""
 
     control: ClassVar[str] = "close_loop"
