@@ -34,11 +34,6 @@ class Evaluation:
     mean_length: float
     """Steps per episode, failures at their full length."""
 
-    @property
-    def successes(self) -> int:
-        """Number of episodes that reached the goal."""
-        return round(self.success_rate * self.episodes)
-
     def scalars(self, prefix: str) -> dict[str, float]:
         """Return the figures by name, for loggers."""
         return {

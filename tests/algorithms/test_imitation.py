@@ -202,7 +202,7 @@ def test_what_of_demonstrations_with_noise_counts_as_demonstrated(
         torch.testing.assert_close(stored[keys.TARGET_ACTION], played[keys.EXPERT_ACTION])
         torch.testing.assert_close(stored[keys.ACTION], played[keys.ACTION])
         return
-    assert keys.TARGET_ACTION not in learner.replay.stored_keys
+    assert keys.TARGET_ACTION not in learner.replay.storage[:]
     number = len(played) if counted == "all" else int(expert.sum())
     assert learner.replay.num_demonstrations == number
     assert len(learner.replay) == len(played)

@@ -438,7 +438,6 @@ def test_a_run_survives_a_worker_that_dies(tmp_path, monkeypatch):
     scalars = read_scalars(config.folder)
     assert scalars["train/faults"].values[-1] == 1
     assert experiment._collection.env.restarts == 1
-    assert experiment.algorithm.replay.faults_dropped >= 1  # more while the worker starts
 
 
 def test_the_recipes_from_collection_to_evaluation(tmp_path, capsys):

@@ -27,9 +27,9 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
 
     Entries, types and shapes of the first transitions are required of all later ones, because
     TorchRL would keep stale values of a missing entry. Transitions whose ``fault`` flag is set are
-    dropped and counted in ``faults_dropped``; the flag is not stored. When the buffer is full, new
-    transitions overwrite the oldest ones that are not demonstrations. The input is not modified.
-    ``dumps`` writes transitions, priorities and the state of the draws.
+    dropped; the flag is not stored. When the buffer is full, new transitions overwrite the oldest
+    ones that are not demonstrations. The input is not modified. ``dumps`` writes transitions,
+    priorities and the state of the draws.
 
     Args:
         storage: the frame storage.
@@ -62,7 +62,6 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
             generator=generator,
             priority_key=keys.TD_ERROR,
         )
-        self.faults_dropped = 0
 
     def add(self, data: TensorDictBase) -> Tensor:
         """Store one transition.
@@ -98,18 +97,11 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
         data = tensordicts.exclude(*_NOT_STORED, _INDEX)
         self._check_schema(data)
         if fault is not None and fault.any():
-            sound = ~fault.reshape(-1)
-            self.faults_dropped += int((~sound).sum())
-            data = data[sound]
+            data = data[~fault.reshape(-1)]
         if not len(data):
             return torch.zeros(0, dtype=torch.long, device="cpu")
         index = super().extend(data, update_priority=update_priority)
         return index[index >= 0]
-
-    @property
-    def stored_keys(self) -> frozenset[NestedKey]:
-        """Entries of the stored transitions; empty before the first."""
-        return frozenset(self._schema() or ())
 
     @property
     def num_demonstrations(self) -> int:

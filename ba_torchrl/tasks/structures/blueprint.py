@@ -116,23 +116,6 @@ class Blueprint:
             if slot.span is not None and self.slots[slot.on[0]].on != self.slots[slot.on[1]].on:
                 raise ValueError(f"slot {number}: its two supports must rest on the same slots")
 
-    @property
-    def optimal_steps(self) -> int:
-        """Picks and places that are needed if every piece starts apart on the ground.
-
-        In each connected part of the support graph one piece stays where it is, and every other
-        piece is moved once.
-        """
-        groups = [{number} for number in range(len(self.slots))]
-        for number, slot in enumerate(self.slots):
-            for other in slot.on:
-                joined = next(group for group in groups if other in group)
-                if number not in joined:
-                    own = next(group for group in groups if number in group)
-                    groups.remove(own)
-                    joined |= own
-        return 2 * (len(self.slots) - len(groups))
-
     def bridge_on(self, number: int) -> int | None:
         """Return the number of the bridge that a slot supports; None if it supports no bridge."""
         for bridge, slot in enumerate(self.slots):

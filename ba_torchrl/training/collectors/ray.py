@@ -33,8 +33,9 @@ _FOREVER = sys.maxsize
 class RayConfig(WorkersConfig):
     """Workers of a Ray cluster, each a Ray actor; they do not wait for each other.
 
-    Ray starts a worker that fails again, on another machine if its own has failed, at most
-    ``max_restarts`` times for one batch; a worker that fails before its first batch is not counted.
+    Ray starts a worker of a machine that fails again on another one that has the resources. If a
+    worker fails more than ``max_restarts`` times before it returns a batch, collection ends; ends
+    of its process in the construction of its environments do not count.
     """
 
     resources: ClassVar[frozenset[str]] = frozenset({"workers", "cpus", "gpus", "address"})

@@ -5,8 +5,8 @@ import math
 import pytest
 
 from ba_torchrl.tasks.structures.blueprint import Blueprint, Slot, tower
-from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF, TRIANGLE
-from tests.tasks.structures.scenes import BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, rotate
+from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF
+from tests.tasks.structures.scenes import SPAN, rotate
 
 
 @pytest.mark.parametrize(
@@ -24,22 +24,6 @@ from tests.tasks.structures.scenes import BRIDGE, SPAN, THREE_STOREYS, TWO_STORE
 def test_impossible_blueprints_are_refused(slots, message):
     with pytest.raises(ValueError, match=message):
         Blueprint(slots)
-
-
-@pytest.mark.parametrize(
-    ("blueprint", "steps"),
-    [
-        (tower(CUBE, CUBE), 2),
-        (tower(CUBE, CUBE, CUBE, CUBE), 6),
-        (tower(CUBE, CUBE, CUBE, TRIANGLE), 6),
-        (BRIDGE, 4),
-        (TWO_STOREYS, 6),
-        (THREE_STOREYS, 10),
-        (Blueprint((Slot(CUBE), Slot(CUBE, on=(0,)), Slot(CUBE), Slot(CUBE, on=(2,)))), 4),
-    ],
-)
-def test_optimal_steps_are_the_papers(blueprint, steps):
-    assert blueprint.optimal_steps == steps
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.0, 1.0, 0.0)])
