@@ -12,6 +12,8 @@ from docs.sources import PACKAGE, ROOT, imports, sources
 
 PAGE = ROOT / "docs" / "architecture.md"
 BEGIN, END = "<!-- imports: begin -->\n", "<!-- imports: end -->\n"
+SPACING = '%%{init: {"flowchart": {"nodeSpacing": 12, "rankSpacing": 30, "padding": 8}}}%%'
+"""Of boxes, so that names are readable on a telephone."""
 
 
 def part_of(names: list[str]) -> str:
@@ -53,7 +55,7 @@ def mermaid() -> str:
     edges = graph()
     # `make` builds environments, which import nothing of it: the functions import when called
     edges["make"] = {"envs"}
-    lines = ["```mermaid", "flowchart TB"]
+    lines = ["```mermaid", SPACING, "flowchart TB"]
     for part in sorted(edges):
         label = "ba_torchrl.make" if part == "make" else f"{part}/"
         lines.append(f'    {part}["{label}"]')

@@ -6,6 +6,7 @@ make docs
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from collections.abc import Iterable, Mapping
 from html.parser import HTMLParser
@@ -41,6 +42,7 @@ myst_fence_as_directive = ["mermaid"]
 viewcode_follow_imported_members = False  # with it, the sources link back to wrong names
 autodoc_member_order = "bysource"
 autodoc_preserve_defaults = True
+mermaid_width, mermaid_height, mermaid_fullscreen = "min(100%, 34rem)", "auto", False
 default_role = "py:obj"
 python_maximum_signature_line_length = 80
 python_use_unqualified_type_names = True
@@ -49,8 +51,10 @@ html_theme = "furo"
 html_title = "BA-TorchRL"
 html_static_path = ["static"]
 html_css_files = ["site.css"]
+html_show_copyright = False
 exclude_patterns = ["_build", "results/**", "tasks.md"]
 
+NAMES = re.compile(r'(?<=<span class="pre">)[^<]{12,}|(?<=<h1>)[^<]+')
 logger = logging.getLogger(__name__)
 FOLDER = Path(__file__).parent
 GENERATED = FOLDER / "generated"
@@ -62,6 +66,7 @@ def setup(app: Sphinx) -> None:
     app.connect("config-inited", lambda *_: write_pages())
     app.connect("autodoc-process-signature", without_fields)
     app.connect("autodoc-process-docstring", keep_colons, priority=100)
+    app.connect("html-page-context", break_names)
     app.connect("build-finished", check_site)
 
 
@@ -81,6 +86,16 @@ def keep_colons(
     if what in ("attribute", "data", "property") and lines:
         first, colon, rest = lines[0].partition(": ")
         lines[:1] = [first + colon.strip(), rest] if colon else [first]
+
+
+def break_names(
+    app: Sphinx, page: str, template: str, context: dict[str, Any], doctree: object
+) -> None:
+    """Let names in code and headings break after their punctuation, where a line is too short."""
+    if "body" in context:
+        context["body"] = NAMES.sub(
+            lambda found: re.sub(r"([_/=.,([])(?=[^\d\s])", r"\1<wbr>", found[0]), context["body"]
+        )
 
 
 class _Page(HTMLParser):
@@ -137,7 +152,8 @@ def write_pages() -> None:
     lines = [
         "# Tasks",
         "",
-        "The last column has the success rates of the expert on four robots.",
+        "[Controls](../environments.md#controls) says what close loop and open loop are. The last",
+        "column has the success rates of the expert on four robots.",
         "",
     ]
     for heading, tasks in groups.items():

@@ -127,7 +127,7 @@ def _compared_cells(group: Group, end: int) -> list[str]:
     return [
         f"`{group.task}`",
         group.method,
-        cell_text(group),
+        _unbroken(cell_text(group)),
         f"{group.area(end):.2f}",
         "–" if math.isnan(steps) else f"{steps:.0f}",
         _mean([run.result.seconds and run.result.seconds / 60 for run in group.runs]),
@@ -135,7 +135,7 @@ def _compared_cells(group: Group, end: int) -> list[str]:
 
 
 def _difference(row: Mapping[str, object]) -> list[str]:
-    interval = f"{row['low']:+.2f} to {row['high']:+.2f}"
+    interval = _unbroken(f"{row['low']:+.2f} to {row['high']:+.2f}")
     names = (f"`{row['task']}`", row["first"], row["second"], row["seeds"])
     return [*map(str, names), f"{row['difference']:+.2f}", interval, str(row["reading"])]
 
@@ -199,11 +199,16 @@ def _rows(board: Leaderboard, task: str) -> Iterator[list[str]]:
             f"`{task}`",
             f"{score.success_rate:.2f}" if score else "",
             group.method,
-            cell_text(group),
+            _unbroken(cell_text(group)),
             _mean([result.last.mean_length for result in results], ".1f"),
             _mean([result.env_steps for result in results]),
             _mean([result.seconds and result.seconds / 60 for result in results]),
         ]
+
+
+def _unbroken(text: str) -> str:
+    """Return a text whose intervals stay in one line."""
+    return text.replace(" to ", "\N{NO-BREAK SPACE}to\N{NO-BREAK SPACE}")
 
 
 def _origin(runs: Sequence[Run]) -> str:

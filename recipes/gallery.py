@@ -41,8 +41,8 @@ from ba_torchrl.training.policy import shipped_policies
 
 STILL = 240
 """Width of the picture of a task, in pixels."""
-MOST_FRAMES, QUALITY = 40, 50
-"""Of a film, a WebP file."""
+MOST_FRAMES, MOST_BYTES, QUALITIES = 40, 200_000, (50, 40, 30)
+"""Of a film, a WebP file: the first quality that is small enough, or the last."""
 ATTEMPTS = 5
 """Episodes after which a film shows one that failed."""
 CELL, TITLE, HEADING, SPACE = 194, 36, 60, 18
@@ -168,19 +168,22 @@ def film_frames(task: str, seed: int) -> tuple[list[np.ndarray], float]:
 
 
 def write_film(frames: Sequence[np.ndarray], milliseconds: float, path: Path) -> Path:
-    """Write images as a WebP of the same duration with at most `MOST_FRAMES` images."""
+    """Write images as a small WebP of the same duration with at most `MOST_FRAMES` images."""
     step = math.ceil(len(frames) / MOST_FRAMES)
     first, *others = (Image.fromarray(frame) for frame in frames[(len(frames) - 1) % step :: step])
     with replaced(path) as scratch:
-        first.save(
-            scratch,
-            format="WEBP",
-            save_all=True,
-            append_images=others,
-            duration=round(step * milliseconds),
-            quality=QUALITY,
-            loop=0,
-        )
+        for quality in QUALITIES:
+            first.save(
+                scratch,
+                format="WEBP",
+                save_all=True,
+                append_images=others,
+                duration=round(step * milliseconds),
+                quality=quality,
+                loop=0,
+            )
+            if scratch.stat().st_size <= MOST_BYTES:
+                break
     return path
 
 

@@ -98,6 +98,13 @@ def test_a_long_film_has_fewer_images_and_ends_with_the_last(tmp_path):
         assert np.asarray(film.convert("RGB")).min() > 245
 
 
+def test_a_film_that_is_too_large_has_a_lower_quality(tmp_path, monkeypatch):
+    frames = list(np.random.default_rng(0).integers(0, 256, (2, 64, 64, 3), dtype=np.uint8))
+    large = write_film(frames, 50, tmp_path / "large.webp").stat().st_size
+    monkeypatch.setattr("recipes.gallery.MOST_BYTES", large - 1)
+    assert write_film(frames, 50, tmp_path / "small.webp").stat().st_size < large
+
+
 def test_an_overview_has_start_and_goal_of_each_task_under_headings(tmp_path, texts, monkeypatch):
     tasks = [f"close_loop/task_{i}" for i in range(3)] + ["ramp/house", "bump/house"]
     monkeypatch.setattr("recipes.gallery.COLUMNS", 2)

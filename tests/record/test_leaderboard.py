@@ -130,7 +130,7 @@ def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
         "close_loop_block_reaching_sacfd_equi_seed1.json",
         "trained.json",
     ]
-    text = page.page_with_results(ALL_TASKS)
+    text = page.page_with_results(ALL_TASKS).replace("\N{NO-BREAK SPACE}", " ")
     rows = re.findall(r"^\| `close_loop/block_(?:reaching|picking)` .*", text, flags=re.MULTILINE)
     assert [row.split(" | ")[2:] for row in rows] == [
         ["sacfd equi (policy from a file)", "0.90 (0.85 to 0.93) 1×200*", "6.0", "–", "– |"],
