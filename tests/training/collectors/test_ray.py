@@ -1,12 +1,15 @@
 """Collection on a Ray cluster, one of whose nodes fails."""
 
 import time
+from unittest.mock import Mock
 
 import pytest
 import torch
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.training import ray_cluster
+from ba_torchrl.training.collectors import ray as collectors
 from ba_torchrl.training.experiment import Experiment
 from tests.training.collectors.runs import (
     change_weights,
@@ -24,6 +27,29 @@ def test_without_ray_one_line_says_how_to_install_it(tmp_path, monkeypatch):
     with pytest.raises(ConfigError, match=r"pip install .*ray") as raised:
         config_for(tmp_path, OPTIONS)
     assert "\n" not in str(raised.value)
+
+
+def test_more_failures_than_max_restarts_end_the_collection(tmp_path, monkeypatch):
+    """Ray counts the failures of each task; it raises the error of the actor in the end."""
+
+    class RayActorError(Exception):
+        pass
+
+    def start_without_ray(self, *_, remote_configs, **__):
+        assert remote_configs["max_task_retries"] == 3
+        self._remote_collectors = [Mock(), Mock()]
+
+    module = Mock(exceptions=Mock(RayActorError=RayActorError))
+    module.cluster_resources.return_value = {"CPU": 2.0}
+    monkeypatch.setattr(ray_cluster, "find_spec", Mock())
+    monkeypatch.setattr(ray_cluster, "ray_module", lambda: module)
+    monkeypatch.setattr(collectors, "ray_module", lambda: module)
+    monkeypatch.setattr(collectors.RayCollector, "__init__", start_without_ray)
+    monkeypatch.setattr(collectors.RayCollector, "iterator", lambda _: map(fail, [0]))
+    fail = Mock(side_effect=RayActorError("the worker died"))
+    collection, _ = start(config_for(tmp_path, OPTIONS, max_restarts=3))
+    with pytest.raises(RuntimeError, match="failed 4 times in a row; the last time: the worker"):
+        next(collection)
 
 
 def nodes_of_workers(ray):
