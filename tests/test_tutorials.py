@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 
 from ba_torchrl import cli
+from ba_torchrl.cli import data_dir
 from docs.notebook import notebook
 from tests.fresh import run_script
 
@@ -56,6 +57,14 @@ def test_what_the_command_writes_passes_its_own_test(kind, tmp_path, monkeypatch
         "raise SystemExit(pytest.main(['-q', 'test_push_far.py']))\n"
     )
     assert "passed" in run_script(tmp_path, code).stdout
+
+
+@pytest.mark.parametrize("kind", ["task", "algorithm", "network"])
+def test_the_name_that_the_tutorial_gives_is_free(kind, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    cli.main(["new", kind, f"my_{kind}"])
+    for file in (f"my_{kind}.py", f"test_my_{kind}.py"):
+        assert Path(file).read_text() == (data_dir("templates") / file).read_text()
 
 
 @pytest.mark.parametrize(

@@ -70,11 +70,12 @@ def main(settings: Settings) -> None:
     """Write the files."""
     kind, name = settings.kind, settings.name
     old, camel = f"my_{kind}", class_name(name)
+    old_camel = class_name(old)
     templates = [(data_dir("templates") / file).read_text(encoding="utf-8") for file in files(old)]
-    if any(re.search(rf"\b{camel}\b", text) for text in templates):
+    if camel != old_camel and any(re.search(rf"\b{camel}\b", text) for text in templates):
         raise ConfigError(f"the module imports another {camel}; choose another name, as my_{name}")
     for path, text in zip(files(name), templates, strict=True):
-        text = text.replace(old, name).replace(f"My{kind.capitalize()}", camel)
+        text = text.replace(old, name).replace(old_camel, camel)
         Path(path).write_text(text, encoding="utf-8")
     print(f"{' and '.join(files(name))} are written. Next:")
     for line in (f"python -m pytest test_{name}.py", *NEXT[kind]):
