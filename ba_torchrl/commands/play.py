@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, Fps, TaskId, Text, VideoFile
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.record.video import write_video
 
@@ -75,7 +75,11 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
         is_expert = settings.policy == "expert"
         resolved = resolve_env(settings.task, {**settings.env, "expert": is_expert})
         return resolved, expert_policy if is_expert else None
-    policy = load_policy(settings.task if settings.policy == "trained" else settings.policy)
+    try:
+        policy = load_policy(settings.task if settings.policy == "trained" else settings.policy)
+    except UnknownNameError as error:
+        known = ("expert", "random", "trained", *error.known)
+        raise UnknownNameError(error.kind, error.name, known, error.hint) from None
     if settings.task not in (None, policy.task):
         raise ConfigError(f"task: {settings.policy} is a policy of {policy.task}")
     return policy.config.resolved_env.changed(**settings.env), policy

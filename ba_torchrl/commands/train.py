@@ -16,6 +16,7 @@ from typing import Any
 
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import CITABLE_EPISODES, CONFIG_FILE, NON_LEARNING_FIELDS
 from ba_torchrl.training.config import ExperimentConfig
 
@@ -24,13 +25,16 @@ logger = logging.getLogger(__name__)
 
 def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
     """Return the run; that of an existing folder if the command line only resumes it."""
-    is_resumed = values["resume"] is True and (Path(values["run_dir"]) / CONFIG_FILE).exists()
-    if values["resume"] is True and not is_resumed:
-        logger.warning("there is no run in %s to resume: a new one starts", values["run_dir"])
     from ba_torchrl.training.checkpoint import read_config
 
-    if is_resumed and arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
-        return read_config(values["run_dir"], **{name: values[name] for name in arguments.names})
+    if values["resume"] is True:
+        folder, exists = values["run_dir"], (Path(values["run_dir"]) / CONFIG_FILE).exists()
+        if arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
+            if not exists:
+                raise ConfigError(f"there is no run in {folder} to resume")
+            return read_config(folder, **{name: values[name] for name in arguments.names})
+        if not exists:
+            logger.warning("there is no run in %s to resume: a new one starts", folder)
     return ExperimentConfig.parse(values, given=arguments.fields)
 
 

@@ -130,7 +130,8 @@ def check_same_run(
     if found:
         lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
         raise ConfigError(
-            f"the run in {config.folder} was started with other settings; choose another folder:"
+            f"the run in {config.folder} was started with other settings; choose another folder, "
+            "or continue it as it was by run_dir= and resume=true alone:"
             + "\n  ".join(["", *lines])
         )
     there, here = there or read_versions(config.folder), versions_of(config.task)

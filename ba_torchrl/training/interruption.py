@@ -63,7 +63,8 @@ class StopSignals:
         name = signal.Signals(self._received).name
         what = "state saved" if is_saved else "nothing to save yet"
         return RunStopped(
-            f"stopped by {name}, {what}: run_dir={folder} resume=true continues", self._received
+            f"stopped by {name}, {what}: ba-torchrl train run_dir={folder} resume=true continues",
+            self._received,
         )
 
     def _note(self, number: int, frame: FrameType | None) -> None:

@@ -10,6 +10,7 @@ import pytest
 from ba_torchrl import cli
 from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import train
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.config import ExperimentConfig
 from tests.fresh import run_script
@@ -122,6 +123,7 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
         (["evaluate", "close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
         (["doctor", "now"], "doctor has no settings"),
         (["play"], "task is missing"),
+        (["play", "close_loop/block_picking", "policy=traned"], "Did you mean 'trained'?"),
         (["play", "--config-name", "x"], "play has no configuration files"),
         (["benchmark", "benchmark=close_loop_4"], "Did you mean 'close_loop_4d'?"),
         (
@@ -212,7 +214,9 @@ def test_the_folder_alone_resumes_a_run(tmp_path, caplog):
     assert caplog.text == ""
     (tmp_path / "other").mkdir()
     new = {**values, "run_dir": str(tmp_path / "other")}
-    assert train.parse(new, given).total_updates == 99
+    with pytest.raises(ConfigError, match=rf"^there is no run in {new['run_dir']} to resume$"):
+        train.parse(new, given)
+    assert train.parse(new, everything).total_updates == 99
     assert f"there is no run in {new['run_dir']} to resume: a new one starts" in caplog.text
 
 
