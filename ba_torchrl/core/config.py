@@ -55,6 +55,8 @@ def explain(
             text = f"{field}.name is missing; known: {', '.join(parts)}"
         else:
             message = item["msg"].removeprefix("Value error, ")
+            if kind == "tuple_type":
+                message = "Input should be a list"
             given = repr(item["input"])
             text = f"{field}: {message}" + (f" (got {given})" if len(given) < 80 else "")
         problems.append((field, text))

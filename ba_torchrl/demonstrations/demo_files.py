@@ -145,8 +145,8 @@ def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, A
     path = Path(path)
     if os.path.exists(path) and not os.path.exists(path / METADATA_FILE):
         raise ConfigError(
-            f"no demonstrations of ours at {path}: export takes folders of `ba-torchrl collect` or "
-            "`play`"
+            f"no demonstrations of ours at {path}: a folder that `ba-torchrl collect` or "
+            "`teleoperate` wrote is needed"
         )
     metadata = read_metadata(path)
     if version := _other_version(metadata):

@@ -31,6 +31,7 @@ def test_unknown_parameter_names_the_nearest_and_all_known():
         ({"object_scale_range": True}, "a number or a"),
         ({"workspace_check": "box"}, "bounding_box"),
         ({"dpos": 0.0}, "dpos"),
+        ({"observations": "proprio"}, "observations: Input should be a list"),
     ],
 )
 def test_wrong_values_say_what_is_allowed(values, message):
