@@ -1,6 +1,5 @@
 """The command line: names, mistakes, help, and what it is given to resume."""
 
-import random
 import signal
 import subprocess
 import sys
@@ -135,35 +134,6 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
 )
 def test_a_mistake_is_one_line_with_the_nearest_name(words, message, capsys):
     assert message in refused(words, capsys)
-
-
-def mistyped(word, rng):
-    """A word with two letters exchanged, one left out, or one twice."""
-    i = rng.randrange(1, len(word) - 1)
-    kind = rng.randrange(3)
-    if kind == 0 and word[i] != word[i + 1]:
-        return word[:i] + word[i + 1] + word[i] + word[i + 2 :]
-    return word[:i] + word[i + 1 :] if kind == 1 else word[: i + 1] + word[i:]
-
-
-def mistyped_lines(count):
-    """Command lines, each with a setting whose name has a slip of the keyboard."""
-    rng = random.Random(0)
-    for _ in range(count):
-        name = rng.choice([name for name in cli.command_names() if name != "doctor"])
-        fields = sorted(load_recipe(name).COMMAND.settings.model_fields)
-        field = rng.choice([field for field in fields if len(field) > 3])
-        wrong = mistyped(field, rng)
-        if wrong not in fields:
-            yield name, f"{wrong}=1", wrong
-
-
-@pytest.mark.parametrize("count", [12, pytest.param(110, marks=pytest.mark.slow)])
-def test_slips_of_the_keyboard(count, capsys):
-    lines = list(mistyped_lines(count))
-    assert len(lines) > 0.9 * count
-    for name, word, wrong in lines:
-        assert f"unknown setting '{wrong}'. Did you mean '" in refused([name, word], capsys)
 
 
 @pytest.mark.parametrize("name", [name for name in cli.command_names() if name != "doctor"])

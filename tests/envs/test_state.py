@@ -4,7 +4,6 @@ import copy
 import pickle
 from functools import partial
 
-import gymnasium
 import pybullet
 import pytest
 import torch
@@ -391,32 +390,6 @@ def test_another_process_continues_a_pickled_environment(tmp_path):
     env.close()
 
 
-@pytest.mark.parametrize("name", ["copy", "deepcopy"])
-def test_a_copy_of_a_gymnasium_environment_is_independent(name):
-    env = gymnasium.make("BulletArm/CloseLoopBlockPicking-v0", obs_size=32).unwrapped
-    env.reset(seed=0)
-    other = COPIES[name](env)
-    down = torch.tensor([1.0, 0.0, 0.0, -1.0, 0.0]).numpy()
-    first = other.step(down)[0]["depth"]
-    assert (other.step(down)[0]["depth"] != first).any()
-    assert (env.step(down)[0]["depth"] == first).all()
-    env.close()
-    other.close()
-
-
-@pytest.mark.parametrize("name", COPIES)
-def test_a_copy_of_a_vector_is_independent(name):
-    options = {"parallel": False, "obs_size": 32, "seed": 0}
-    env = ba_torchrl.make_vector_env("close_loop/block_picking", 2, **options)
-    state = env.reset().set("action", torch.tensor([[1.0, 0.0, 0.0, -1.0, 0.0]] * 2))
-    other = COPIES[name](env)
-    first = other.step(state.clone())["next", "depth"]
-    other.step(state.clone())
-    assert torch.equal(env.step(state.clone())["next", "depth"], first)
-    env.close()
-    other.close()
-
-
 @pytest.mark.parametrize("name", COPIES)
 def test_a_copy_of_a_vector_continues_over_the_ends_of_episodes(name):
     options = {"parallel": False, "obs_size": 32, "seed": 0, "max_steps": 3}
@@ -438,23 +411,3 @@ def test_a_copy_of_a_vector_continues_over_the_ends_of_episodes(name):
         assert torch.equal(first["depth"], second["depth"])
     env.close()
     other.close()
-
-
-@pytest.mark.parametrize("name", COPIES)
-def test_worker_processes_are_not_copied(name, make_fakes):
-    env = make_fakes(2)
-    with pytest.raises(TypeError, match=r"get_positions.*get_state"):
-        COPIES[name](env)
-
-
-def test_parts_of_an_environment_cannot_be_copied():
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
-    depth = env.reset()["depth"]
-    state = copy.deepcopy(env.get_state())  # a state never changes: the same one
-    for part in (env.scene, env.scene.world, env.scene.robot, env.scene.task.objects[0]):
-        for make_copy in (copy.deepcopy, pickle.dumps):
-            with pytest.raises(TypeError, match="copy the environment"):
-                make_copy(part)
-    env.step(env.reset().set("action", torch.zeros(5)))
-    assert torch.equal(env.reset(state, set_state=True)["depth"], depth)
-    env.close()

@@ -19,7 +19,6 @@ from ba_torchrl.record.results import read_result, run_folders
 from ba_torchrl.training.checkpoint import Checkpoints, load, write_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.learner import build_algorithm
-from recipes.soak import TABLE_FILE, SoakJob, run_soak
 from tests.fuzz.values import JSON, check, examples
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 4}
@@ -187,29 +186,3 @@ def test_scalars(tmp_path, count):
             pass  # documented
 
     check(count, st.one_of(DAMAGES, st.tuples(st.just("bytes"), ROWS)), prop)
-
-
-@examples(20)
-def test_figures_of_a_soak_test(tmp_path, count):
-    job = SoakJob(task=TASK, steps=10)
-    figures = {
-        "job": job.model_dump(),
-        "episodes": 2,
-        "expert_success": 1.0,
-        "faults": 0,
-        "steps_per_s": 3.0,
-        "memory_mb": 4.0,
-        "memory_growth": 0.0,
-        "clients_left": 0,
-    }
-    path = tmp_path / f"{TASK.replace('/', '-')}.json"
-    worker = ("sh", "-c", f"echo '{json.dumps(figures)}'")
-
-    def prop(changes):
-        path.write_text(json.dumps(figures))
-        damage(path, *changes)
-        failures = run_soak([job], tmp_path, progress=False, worker=worker)
-        assert set(failures) <= {TASK}
-        assert (tmp_path / TABLE_FILE).read_text().count(TASK) == 1
-
-    check(count, DAMAGES, prop)

@@ -1,8 +1,5 @@
 """Every registered actor-critic: sizes, shapes, precision, errors."""
 
-import copy
-import pickle
-
 import pytest
 import torch
 from pydantic import ValidationError
@@ -66,18 +63,6 @@ def test_outputs_depend_on_holding_and_action(name):
         values = networks.critic(features, action), networks.critic(features, torch.zeros(5))
         assert not torch.allclose(*values)
     assert values[0][0] != values[0][1]  # the twins are different functions
-
-
-@pytest.mark.parametrize("name", ACTOR_CRITICS)
-def test_copies_and_pickles_are_small_and_equal(name):
-    """Policies are copied for evaluation and sent to processes that may lack escnn."""
-    networks = small(name)
-    depth, holding = torch.rand(1, 64, 64), torch.tensor([True])
-    data = pickle.dumps(networks.actor)
-    assert b"escnn" not in data
-    assert len(data) < 4 * count(networks.actor) + 3e5
-    for other in (copy.deepcopy(networks.actor), pickle.loads(data)):
-        assert torch.equal(other(depth, holding)[0], networks.actor(depth, holding)[0])
 
 
 @pytest.mark.parametrize("name", ACTOR_CRITICS)

@@ -2,17 +2,12 @@
 
 import dataclasses
 import json
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
 
 from profiling.fingerprint.cases import Case
 from profiling.fingerprint.compare import compare, differences
 from profiling.fingerprint.record import run_case
-
-RECIPE = Path(__file__).parents[2] / "recipes" / "fingerprint.py"
 
 
 @pytest.fixture(scope="module")
@@ -47,30 +42,3 @@ def test_a_changed_number_is_found(case):
     new["traces"]["random"]["steps"][2]["reward"] = ["0" * 16, [0.5]]
     (line,) = differences(old, new)
     assert line == "random: step 2: reward: difference 0.5, [0] -> [0.5]"
-
-
-@pytest.mark.slow
-def test_the_recipe_records_and_compares(tmp_path):
-    """The recipe runs cases in spawned processes; a changed record gives exit code 1."""
-    path = tmp_path / "record.json"
-
-    def run(*arguments):
-        return subprocess.run(
-            [sys.executable, RECIPE, *arguments, "--workers", "1"],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
-
-    name = "envs close_loop/block_reaching without expert"
-    recorded = run(f"--match={name}", f"--out={path}")
-    assert recorded.returncode == 0, recorded.stderr
-    record = json.loads(path.read_text())
-    assert list(record["cases"]) == [name]
-    reward = record["cases"][name]["traces"]["random"]["steps"][1]["reward"]
-    reward[:] = ["0" * 16, [0.5]]
-    path.write_text(json.dumps(record))
-    compared = run(f"--compare={path}", f"--match={name}")
-    assert compared.returncode == 1, compared.stderr
-    assert "random: step 1: reward: difference 0.5, [0.5] -> [0]" in compared.stdout
-    assert compared.stdout.endswith("different: 1 of 1 cases\n")

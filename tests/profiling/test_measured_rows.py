@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from tqdm import tqdm
 
 from ba_torchrl.core.config import WorkerOptions
-from profiling import layers, learning, limits, throughput
+from profiling import learning, limits, throughput
 from profiling.limits import count_multiply_adds
 from profiling.table import COLUMNS, Bench, Budget, Row, as_markdown
 
@@ -91,23 +91,3 @@ def test_frames_per_second(monkeypatch):
         assert row.multiple == pytest.approx(
             sum(row.values) / 2 * sum(row.unit_s) / 2
         )  # frames during a unit
-
-
-@pytest.mark.slow
-def test_layers_are_measured_in_pairs(monkeypatch):
-    pytest.importorskip("escnn")
-    monkeypatch.setattr(layers, "BATCH", 2)
-    monkeypatch.setattr(layers, "LearningUnit", lambda _: lambda: None)
-    with tqdm(disable=True) as bar:
-        bench = Bench(1, bar)
-        convolutions = layers.measure_steerable(bench, 2, 3, 8)
-        pools = layers.measure_max_pool(bench, "channels-last")
-    rows = (*convolutions, *pools)
-    assert [row.work.rpartition(", ")[2] for row in rows] == [
-        "expanded filter",
-        "basis of irreps",
-        "PyTorch",
-        "one pass",
-        "slope 0.1",
-    ]
-    assert all(row.values[0] > 0 for row in rows)

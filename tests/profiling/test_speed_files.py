@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from hypothesis import strategies as st
 
 from ba_torchrl.core.errors import ConfigError
 from profiling.comparison import changes, columns_of_changes, ratio_of_medians
@@ -17,7 +16,6 @@ from profiling.speed_file import (
     write_speed_file,
 )
 from profiling.table import COLUMNS, Budget, Row, as_markdown
-from tests.fuzz.values import JSON, check, examples
 from tests.recipes import recipe
 
 ROOT = Path(__file__).parents[2]
@@ -63,17 +61,6 @@ def test_a_foreign_file_is_refused_in_one_line(damage, reason, tmp_path, content
     assert "\n" not in str(raised.value)
 
 
-@examples(30)
-def test_damaged_files_are_refused(tmp_path, count):
-    def prop(data):
-        path = tmp_path / "speed.json"
-        path.write_bytes(data if isinstance(data, bytes) else json.dumps(data).encode())
-        with pytest.raises(ConfigError):
-            read_speed_file(path)
-
-    check(count, st.one_of(st.binary(max_size=40), JSON), prop)
-
-
 def test_the_recipe_writes_a_file_and_compares_with_it(monkeypatch, tmp_path, content, capsys):
     monkeypatch.chdir(tmp_path)
     old = Row("depth image, 128 px, compiled", "ms", [1e3] * 20, unit_s=[1e-3] * 20)
@@ -105,33 +92,6 @@ def test_the_recipe_writes_a_file_and_compares_with_it(monkeypatch, tmp_path, co
     assert f"{new.machine}, precision {new.precision}" == where
     assert [row.work for row in new.rows] == [row["work"] for row in cells]
     assert len(new.rows[0].values) == len(new.rows[0].unit_s) == 10
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["compare=none.json"], "error: cannot read none.json: No such file or directory"),
-        (["compare=."], "error: cannot read .: Is a directory"),
-        (
-            ["output=speed.csv"],
-            "error: invalid settings: output: the name of the file ends in .json",
-        ),
-        (["repeats=few"], "error: invalid settings: repeats: Input should be a valid integer"),
-        (["precision=float16"], "error: invalid settings: precision: Input should be 'auto', "),
-        (["device=nothing"], "error: device: use device=cpu or device=auto"),
-    ],
-)
-def test_mistakes_are_reported_in_one_line_before_the_measurement(
-    arguments, message, monkeypatch, tmp_path, capsys
-):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as ended:
-        recipe("measure", *arguments)
-    assert ended.value.code == 2
-    out, error = capsys.readouterr()
-    assert error.startswith(message)
-    assert error.count("\n") == 1
-    assert out == ""
 
 
 # -- noise -----------------------------------------------------------------------------------------

@@ -4,7 +4,6 @@ import pytest
 import torch
 from tqdm import tqdm
 
-import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
 from profiling import throughput
 from profiling.table import (
@@ -13,44 +12,6 @@ from profiling.table import (
     Bench,
     measure,
 )
-from tests.recipes import recipe
-
-
-@pytest.fixture
-def printed_table(tmp_path, monkeypatch, capsys):
-    """Return a function that runs the recipe and returns the header, the rows and their work."""
-    monkeypatch.chdir(tmp_path)
-
-    def run(which):
-        recipe("measure", f"which={which}", "repeats=1")
-        return cells(capsys.readouterr().out)
-
-    return run
-
-
-def cells(text):
-    header, rule, *rows, empty, where = text.strip().split("\n")
-    assert set(rule) == {"|", "-"}
-    assert empty == ""
-    assert "torch" in where
-    columns = header.count("|")
-    assert all(row.count("|") == columns for row in rows)
-    return header, rows, [row.split("|")[1].strip() for row in rows]
-
-
-@pytest.mark.slow
-def test_the_recipe_prints_the_simulation_rows(printed_table):
-    _, rows, work = printed_table("simulation")
-    tasks = ba_torchrl.list_tasks()
-    # step and reset, physics, reset with a seed, expert; depth images
-    assert len(work) == len(set(work)) == 7 * len(tasks) + 2
-    for task in tasks:
-        (step,) = (row for row in rows if f"| {task}, step, 128 px |" in row)
-        assert "physics steps per action" in step
-        assert sum(f"| {task}, reset |" in row for row in rows) == 1
-    picking = next(row for row in rows if "close_loop/block_picking, step, " in row).split("|")
-    assert [cell.strip() for cell in picking[7:10]] == ["31", "1.5", "0.8"]  # from the budgets
-    assert all(float(cell) > 0 for cell in picking[3:6])
 
 
 def test_memory_is_counted():

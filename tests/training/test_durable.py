@@ -16,8 +16,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import CHECKSUMS_FILE, fingerprint, seal
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
-from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.record.results import read_failure, read_result
+from ba_torchrl.record.results import read_failure
 from ba_torchrl.training.checkpoint import (
     find_checkpoint,
     load,
@@ -166,44 +165,9 @@ def test_no_file_of_a_checkpoint_runs_code(run, tmp_path):
     assert_no_file_runs(checkpoint, lambda: load(checkpoint), tmp_path)
 
 
-def test_no_file_of_a_state_runs_code(run, tmp_path):
-    newest = max((run / "resume").iterdir())
-    only = shutil.copytree(run, tmp_path / "copy")
-    shutil.rmtree(only / "resume")
-    state = shutil.copytree(newest, only / "resume" / newest.name)
-    spare = shutil.copytree(newest, tmp_path / "spare")
-
-    def open_state():
-        experiment = Experiment(config_for(only, resume=True), progress=False)
-        try:
-            experiment._resume_state.load()
-        finally:
-            experiment.close()
-            if not state.exists():
-                shutil.copytree(spare, state)
-
-    assert_no_file_runs(state, open_state, tmp_path)
-
-
 def test_no_file_of_demonstrations_runs_code(demonstrations, tmp_path):
     folder = shutil.copytree(demonstrations, tmp_path / "demos")
     assert_no_file_runs(folder, lambda: load_demonstrations(folder, task=TASK, env=ENV), tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("name", "opened"),
-    [
-        ("config.json", read_config),
-        ("result.json", read_result),
-        ("scalars.csv", read_scalars),
-    ],
-)
-def test_no_record_of_a_run_runs_code(tmp_path, name, opened):
-    trace = tmp_path / "trace"
-    (tmp_path / name).write_bytes(pickle.dumps(Planted(trace)))
-    with pytest.raises(ValueError, match=name):
-        opened(tmp_path)
-    assert not trace.exists()
 
 
 def test_no_module_that_a_run_names_is_imported(run, monkeypatch):
@@ -255,12 +219,6 @@ def test_a_damaged_state_falls_back_to_the_one_before(run, damage, caplog):
     assert len(list((run / "resume").iterdir())) == 1  # the damaged one is deleted
 
 
-def test_a_torn_manifest_of_the_newest_state_is_reported(run, caplog):
-    cut(max((run / "resume").iterdir()) / "manifest.json")
-    assert resume(run).algorithm.updates == 2
-    assert "manifest.json" in caplog.text
-
-
 def test_a_run_whose_states_are_all_damaged_says_what_to_do(run):
     for state in (run / "resume").iterdir():
         cut(largest(state))
@@ -304,12 +262,6 @@ def test_files_nested_without_end_are_damaged(tmp_path):
         read_config(tmp_path)
     with pytest.raises(ConfigError, match="no demonstrations at"):
         load_demonstrations(tmp_path, task=TASK, env=ENV)
-
-
-def test_checksums_nested_without_end_are_damaged(run):
-    checkpoint = find_checkpoint(run, "latest")
-    (checkpoint / CHECKSUMS_FILE).write_text("[" * 200_000)
-    assert find_checkpoint(run, "latest") != checkpoint
 
 
 @pytest.mark.parametrize("content", ["null", "[]", '"text"', "1", "{}"])

@@ -134,18 +134,32 @@ def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, un
     assert read_result(tmp_path).resumed_at == [after]
 
 
-@pytest.mark.parametrize("after", [10, *slow([7])])
-def test_unfinished_episodes_of_self_imitation_are_continued(tmp_path, after):
-    algorithm = {**SAC["algorithm"], "imitation": {"name": "successes"}}
-    whole = Experiment(config_for(tmp_path / "whole", algorithm=algorithm), progress=False)
-    whole.run()
-    experiment = Experiment(config_for(tmp_path / "run", algorithm=algorithm), progress=False)
-    at_call(experiment, experiment.algorithm, "update", after, terminate)
+SELF_IMITATION = {"algorithm": {**SAC["algorithm"], "imitation": {"name": "successes"}}}
+FERM = {
+    "algorithm": {
+        "name": "sac",
+        "batch_size": 4,
+        "replay": {"name": "uniform", "capacity": 60},
+        "views": {"name": "shift"},
+        "contrastive": {"name": "info_nce", "updates": 2},
+        "optimizer": {"learning_rate_end_factor": 0.1},
+    },
+    "network": {"name": "ferm", "width": 0.1, "features": 8},
+    "pretrain_updates": 0,  # two of the contrastive loss instead
+}
+"""Optimisers of single terms of the loss, with a schedule."""
+
+
+@pytest.mark.parametrize("changes", [SELF_IMITATION, FERM], ids=["self-imitation", "ferm"])
+def test_other_parts_of_an_algorithm_continue_with_the_same_bits(tmp_path, changes):
+    whole = run(config_for(tmp_path / "whole", **changes))
+    experiment = Experiment(config_for(tmp_path / "run", **changes), progress=False)
+    at_call(experiment, experiment.algorithm, "update", 10, terminate)
     with pytest.raises(RunStopped):
         experiment.run()
-    assert len(experiment.algorithm.episodes) > 0
-    resumed = config_for(tmp_path / "run", algorithm=algorithm, resume=True)
-    assert_same(run(resumed), outcome(whole))
+    if changes is SELF_IMITATION:
+        assert len(experiment.algorithm.episodes) > 0  # unfinished ones
+    assert_same(run(config_for(tmp_path / "run", **changes, resume=True)), whole)
 
 
 def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undisturbed):

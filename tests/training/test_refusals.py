@@ -1,43 +1,15 @@
 """Errors name what the user wrote, and packages that are missing."""
 
-import json
 import re
-import sys
 
 import pytest
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.core.errors import ConfigError
-from tests.cli.test_commands import RUN
 from tests.recipes import recipe
 from tests.training.test_experiment import TINY, tiny
 
 OPEN = ("task=open_loop/block_stacking", "algorithm=dqn")
-
-
-@pytest.mark.parametrize(
-    ("name", "package", "overrides"),
-    [
-        ("train", "matplotlib", ("network=equi", "algorithm=sac", "run_dir=new")),
-        ("train", "imageio", ("network=equi_fcn", *OPEN, "run_dir=new")),
-    ],
-)
-def test_a_missing_package_is_one_line(name, package, overrides, capsys, monkeypatch, tmp_path):
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setitem(sys.modules, package, None)
-    (tmp_path / "run").mkdir()
-    (tmp_path / "run/config.json").write_text(json.dumps(RUN))
-    names = ("success_rate", "standard_error")
-    rows = "".join(f"5,eval/{name},0.5\n" for name in names)
-    (tmp_path / "run/scalars.csv").write_text(f"step,name,value\n{rows}")
-    with pytest.raises(SystemExit) as end:
-        recipe(name, *overrides)
-    error = capsys.readouterr().err
-    assert end.value.code == EXIT_CODE
-    assert error.startswith("error: ")
-    assert "pip install" in error
-    assert error.count("\n") == 1
 
 
 @pytest.mark.parametrize("control", ["close_loop", "open_loop"])

@@ -121,29 +121,6 @@ def test_random_interleavings_and_wrap_around(capacity):
     assert_same(sample, torch.stack([expected[i] for i in sample["index"].tolist()]))
 
 
-def test_a_batch_larger_than_the_capacity_keeps_its_last_transitions():
-    rb, rng = buffer(6), np.random.default_rng(2)
-    data = episode(20, rng)
-    rb.extend(data)
-    assert len(rb) == 6
-    stored = rb[:]
-    order = stored[keys.ACTION][:, 0]
-    for i in range(14, 20):
-        place = i % 6
-        assert_same(stored[place : place + 1], data[i : i + 1])
-    assert len(order.unique()) == 6
-    assert rb.storage.frame_count == 7
-
-
-def test_equal_frames_of_different_episodes_are_kept_once():
-    rb, rng = buffer(), np.random.default_rng(3)
-    data = episode(5, rng)
-    for _ in range(4):
-        rb.extend(data)
-    assert len(rb) == 20
-    assert rb.storage.frame_count == 6
-
-
 def test_frame_table_counts_frees_and_reuses():
     table = FrameTable(torch.Size([1, 2, 2]))
     a, b, c, d = (np.full(4, i, dtype=np.uint8) for i in range(4))
@@ -238,14 +215,6 @@ def test_reserved_memory_costs_nothing_until_used():
     assert growth < counted + 3e7  # the allocator's own slack
 
 
-def test_overwriting_reuses_frames():
-    rb, rng = buffer(20), np.random.default_rng(6)
-    for _ in range(50):
-        rb.extend(episode(5, rng))
-    assert rb.storage.frame_count == 24
-    assert rb.storage._frames[keys.DEPTH].nbytes < 30 * (100 + 64 + 60)  # slots are used again
-
-
 @pytest.mark.parametrize("kind", ["uniform", "prioritized", "symmetric"])
 def test_samples_are_float_metres_with_an_index(kind):
     rb, rng = buffer(kind=kind), np.random.default_rng(7)
@@ -264,15 +233,6 @@ def test_samples_are_float_metres_with_an_index(kind):
     assert torch.equal(again.sample()["index"], sample["index"])
     sample[keys.DEPTH].zero_()  # a sample is a copy
     assert_same(rb[:], data)
-
-
-def test_experts_are_preferred():
-    rb, rng = buffer(100), np.random.default_rng(8)
-    rb.extend(torch.cat([episode(50, rng, size=2, expert=True), episode(50, rng, size=2)]))
-    rb.update_priority(torch.arange(100), torch.ones(100))
-    expert = torch.cat([rb.sample(500)[keys.IS_DEMONSTRATION] for _ in range(10)])
-    wanted = 2**0.6 / (2**0.6 + 1)
-    assert expert.float().mean().item() == pytest.approx(wanted, abs=0.03)
 
 
 def test_faults_never_enter():

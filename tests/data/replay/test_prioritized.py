@@ -373,31 +373,6 @@ def test_invalid_arguments_are_refused():
         buffer.sample()
 
 
-def test_a_storage_of_two_dimensions():
-    sampler = ExpertPrioritizedSampler(12, alpha=1.0, expert_bonus=0.0)
-    rb = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(12, ndim=2),
-        sampler=sampler,
-        batch_size=4000,
-        priority_key="td",
-        generator=torch.Generator().manual_seed(0),
-    )
-    data = TensorDict(
-        {
-            "number": torch.arange(12).reshape(4, 3),
-            "is_demonstration": torch.zeros(4, 3, 1, dtype=torch.bool),
-            "td": torch.ones(4, 3),
-        },
-        batch_size=[4, 3],
-    )
-    rb.extend(data)
-    batch = rb.sample()
-    assert set(batch["number"].tolist()) == set(range(12))
-    batch["td"] = torch.where(batch["number"] == 7, 1e6, 0.0)
-    rb.update_tensordict_priority(batch)
-    assert set(rb.sample()["number"].tolist()) == {7}
-
-
 def test_the_bonus_in_a_storage_of_two_dimensions_is_that_of_the_experts():
     sampler = ExpertPrioritizedSampler(6, alpha=1.0, expert_bonus=1e6)
     rb = TensorDictReplayBuffer(

@@ -1,7 +1,6 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from torchrl.data import ReplayBuffer
 
 from ba_torchrl.data.replay.codecs import HalfPrecision
 from ba_torchrl.data.replay.make import make_replay
@@ -52,19 +51,6 @@ def filled(**settings):
     return made
 
 
-def test_it_is_a_torchrl_replay_buffer():
-    made = filled()
-    assert isinstance(made, ReplayBuffer)
-    batch, info = made.sample(6, return_info=True)
-    assert batch.batch_size == (6,)
-    assert set(info) == {"index"}
-    made.add(transitions([91], False)[0])
-    assert len(made) == 51
-    other = replay(seed=3)
-    other.load_state_dict(made.state_dict())
-    assert torch.equal(other.sample()["action"], made.sample()["action"])
-
-
 def test_a_batch_of_odd_size_has_one_demonstration_more():
     assert filled(batch_size=7).sample()["is_demonstration"].sum() == 4
 
@@ -77,20 +63,6 @@ def test_one_side_fills_the_batch_while_the_other_is_empty(is_demonstration):
     assert made.sample().batch_size == (8,)
 
 
-def test_the_capacity_is_that_of_both_sides_and_demonstrations_are_never_overwritten():
-    made = filled(capacity=20)
-    for start in range(0, 300, 30):
-        assert len(made) == 20
-        made.extend(transitions(range(100 + start, 130 + start), False))
-    assert (len(made), made.num_demonstrations) == (20, 10)
-    numbers = {int(n) for _ in range(100) for n in made.sample()["action"]}
-    assert numbers == {*range(10), *range(390, 400)}
-    made.extend(transitions(range(20, 24), True))  # in place of the oldest others
-    assert (len(made), made.num_demonstrations) == (20, 14)
-    numbers = {int(n) for _ in range(200) for n in made.sample()["action"]}
-    assert numbers == {*range(10), *range(20, 24), *range(394, 400)}
-
-
 def test_each_side_is_drawn_uniformly_by_its_own_generator():
     made = replay(seed=3)
     made.extend(transitions(range(4), True))
@@ -101,20 +73,6 @@ def test_each_side_is_drawn_uniformly_by_its_own_generator():
         expected = torch.randint(9, (4,), generator=expert).tolist()
         expected += (50 + torch.randint(10, (4,), generator=online)).tolist()
         assert made.sample()["action"].flatten().tolist() == expected
-
-
-def test_images_are_restored_within_the_error_of_the_codec():
-    made = filled()
-    batch = made.sample()
-    for key, offset in [
-        ("heightmap", 0.0),
-        ("in_hand", 0.01),
-        (("next", "heightmap"), 0.02),
-        (("next", "in_hand"), 0.03),
-    ]:
-        expected = batch["action"].reshape(-1, 1, 1, 1) / 1024 + offset
-        assert batch[key].dtype == torch.float32
-        assert (batch[key] - expected).abs().max() <= CODEC.max_error_m
 
 
 def test_the_seed_determines_the_draws_and_a_saved_replay_continues_them(tmp_path):
@@ -130,8 +88,3 @@ def test_the_seed_determines_the_draws_and_a_saved_replay_continues_them(tmp_pat
         assert torch.equal(first.sample()["action"], restored.sample()["action"])
     numbers = {int(n) for _ in range(200) for n in restored.sample()["action"]}
     assert numbers == {*range(10), *range(50, 90)}
-
-
-def test_an_empty_replay_raises():
-    with pytest.raises(RuntimeError, match="empty"):
-        replay().sample()

@@ -35,7 +35,7 @@ def numbers_in(made):
     return made.storage.column(keys.ACTION)[:, 0].int().tolist()
 
 
-@pytest.mark.parametrize("kind", ["uniform", "prioritized"])
+@pytest.mark.parametrize("kind", ["uniform", "prioritized", "symmetric"])
 def test_demonstrations_are_kept_in_a_full_replay(kind):
     made = replay(kind=kind)
     made.extend(transitions(range(30), True))

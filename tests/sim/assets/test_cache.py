@@ -10,6 +10,7 @@ import numpy as np
 from ba_torchrl.sim.assets import cache
 from ba_torchrl.sim.assets.cache import CACHE_VARIABLE, Decomposition, cached_parts
 from ba_torchrl.sim.meshes import Mesh, box_mesh, transform_mesh
+from tests.planted import Planted
 
 
 def make_box():
@@ -51,6 +52,16 @@ def test_a_damaged_entry_is_computed_again(own_cache, caplog):
         np.testing.assert_array_equal(part.vertices, box_mesh((1.0, 1.0, 1.0)).vertices)
         assert path.read_bytes() == whole
     assert "computed again" in caplog.text
+
+
+def test_objects_in_an_entry_are_not_unpickled(own_cache, tmp_path):
+    cached_parts(b"content", "recipe", make_box)
+    (path,) = own_cache.rglob("*.npz")
+    planted = np.array([Planted(tmp_path / "trace")])
+    np.savez(path, vertices=planted, faces=planted, vertex_ends=planted, face_ends=planted)
+    (part,) = cached_parts(b"content", "recipe", make_box).parts
+    np.testing.assert_array_equal(part.vertices, box_mesh((1.0, 1.0, 1.0)).vertices)
+    assert not (tmp_path / "trace").exists()
 
 
 def test_a_cache_that_cannot_be_written_is_reported_and_not_used(monkeypatch, tmp_path, caplog):
