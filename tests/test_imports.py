@@ -173,19 +173,6 @@ def test_no_two_files_import_each_other():
     assert circles(imports) == set()
 
 
-@pytest.mark.parametrize(
-    ("module", "source", "culprit"),
-    [
-        ("ba_torchrl.sim.world", "def f():\n    from torch.nn import Linear", "torch.nn"),
-        ("ba_torchrl.tasks.base", "from ..envs import keys", "envs"),
-        ("ba_torchrl.modules.cnn", "from ba_torchrl.data import as_transitions", "data"),
-    ],
-)
-def test_a_wrong_import_is_found(module, source, culprit):
-    (found,) = violations(source, module, {"ba_torchrl.envs"})
-    assert f"imports {culprit}" in found
-
-
 def loaded_after(imports):
     """Return the top-level packages a fresh interpreter holds after importing ``imports``."""
     code = (

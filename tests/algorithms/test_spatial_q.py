@@ -9,10 +9,6 @@ from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 import ba_torchrl
-from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-from ba_torchrl.algorithms.spatial_q import SpatialQConfig
-from ba_torchrl.core.config import parse
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
@@ -149,18 +145,6 @@ def test_an_action_without_yaw_supports_networks_without_yaw_only(transitions):
         build("asr", "pxy")
     with pytest.raises(ValueError, match="no yaw"):
         build("fcn", "pxy", rotation={"name": "se2"})
-
-
-def test_networks_and_tasks_of_the_other_control_are_refused():
-    spatial, close = parse(SpatialQConfig, {}, "q"), parse(ALGORITHMS["sac"], {}, "sac")
-    cnn, fcn = parse(NETWORKS["cnn"], {}, "cnn"), parse(NETWORKS["fcn"], {}, "fcn")
-    with pytest.raises(ConfigError, match=r"for close_loop tasks; open_loop tasks take .* asr"):
-        spatial.check(cnn, "open_loop")
-    with pytest.raises(ConfigError, match=r"for open_loop tasks; close_loop tasks take .* cnn"):
-        close.check(fcn, "close_loop")
-    with pytest.raises(ConfigError, match="learns open_loop tasks, not close_loop ones"):
-        spatial.check(cnn, "close_loop")
-    spatial.check(fcn, "open_loop")
 
 
 def test_demonstrations_are_executed_as_they_are_learnt(transitions):

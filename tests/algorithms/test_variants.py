@@ -92,16 +92,6 @@ def test_two_updates_change_every_network(preset, network):
         assert algorithm.policy(state)[keys.ACTION].isfinite().all()
 
 
-@pytest.mark.parametrize("preset", ["rad", "drq", "ferm"])
-def test_a_restored_learner_continues_the_same_views(preset):
-    first, second = build(preset, "cnn"), build(preset, "cnn")
-    first.extend(transitions(first))
-    first.update()
-    second.load_state_dict(first.state_dict())
-    second.load_replay_state(first.replay_state())
-    assert torch.equal(first.sample()[keys.DEPTH], second.sample()[keys.DEPTH])
-
-
 def test_the_options_reach_augmentation_loss_and_target_update():
     drq = build("drq", "cnn", views={"name": "shift", "pixels": 3, "views": 3, "target_views": 2})
     (augmentation,) = drq.replay.transform

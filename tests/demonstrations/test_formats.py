@@ -379,14 +379,6 @@ def test_demonstrations_of_another_robot_are_mapped(as_file, tmp_path):
         assert first[key].shape[1:] == plain[key].shape[1:], key
 
 
-def test_failures_of_another_robot_are_mapped(tmp_path):
-    path = foreign(tmp_path / "b.hdf5", won=np.zeros(3))
-    found = load_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, "success": "won"})
-    assert not any(each["next", "success"].any() for each in found)
-    assert found[0]["next", "truncated"].flatten().tolist() == [False, False, True]
-    assert found[0]["next", "reward"].sum() == 0
-
-
 @pytest.mark.parametrize(
     ("results", "success", "terminated"),
     [

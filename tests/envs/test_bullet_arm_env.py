@@ -1,7 +1,6 @@
 """BulletArmEnv: the class of all environments, their actions, faults and episodes."""
 
 import copy
-import logging
 import pickle
 from functools import partial
 
@@ -163,22 +162,6 @@ def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel():
         env.close()
     assert torch.equal(rollouts[0]["next", "depth"], rollouts[1]["next", "depth"])
     assert not torch.equal(rollouts[0]["depth"][0, 0], rollouts[0]["depth"][1, 0])
-
-
-def test_a_simulator_fault_ends_the_episode_truncated(env, monkeypatch, caplog):
-    state = env.reset()
-    with monkeypatch.context() as patch, caplog.at_level(logging.ERROR):
-        patch.setattr(env.scene.controller, "move_to", _fail)
-        following = env.step(state.set("action", torch.zeros(5)))["next"]
-    assert following["fault"]
-    assert following["truncated"]
-    assert not following["terminated"]
-    assert following["reward"] == 0
-    assert env.faults == 1
-    assert "simulator fault" in caplog.text
-    assert "the solver exploded" in caplog.text
-    state = env.reset()
-    assert not env.step(state.set("action", torch.zeros(5)))["next", "fault"]
 
 
 def test_repeated_faults_are_an_error(env, monkeypatch):

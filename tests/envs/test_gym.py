@@ -11,7 +11,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.utils.passive_env_checker import env_render_passive_checker
 
 import ba_torchrl
-from ba_torchrl.core.errors import ConfigError, InvalidActionError, SimulationError
+from ba_torchrl.core.errors import ConfigError, SimulationError
 from ba_torchrl.envs import gym
 from ba_torchrl.envs.registration import gym_id
 from ba_torchrl.tasks.base import TASKS as REGISTRY
@@ -213,25 +213,6 @@ def test_a_simulator_fault_truncates_and_is_in_info(make, monkeypatch, caplog):
     assert not info["is_grasped"]
     env.reset()
     assert not env.step(NOTHING)[-1]["fault"]
-
-
-@pytest.mark.parametrize(
-    ("action", "message"),
-    [
-        (np.array([0, 0, 1e300, 0, 0]), "not finite"),
-        (np.zeros((1, 5), dtype=np.float32), r"shape \(5,\)"),
-        (np.zeros(5, dtype=np.int64), "int64"),
-        (["open", 0.0, 0.0, 0.0, 0.0], "floating-point"),
-    ],
-)
-def test_bad_actions_raise_before_anything_moves(make, action, message):
-    env = make().unwrapped
-    env.reset()
-    before = env.torchrl_env.scene.world.steps
-    with pytest.raises(InvalidActionError, match=message):
-        env.step(action)
-    assert env.torchrl_env.scene.world.steps == before
-    assert env.step(NOTHING)[-1]["step_count"] == 1
 
 
 # -- rendering, closing --------------------------------------------------------------------------

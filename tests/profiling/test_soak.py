@@ -5,7 +5,6 @@ import sys
 
 import pytest
 
-from recipes import soak
 from recipes.soak import TABLE_FILE, SoakFigures, SoakJob, run_soak
 
 JOB = SoakJob(task="close_loop/block_reaching", steps=60, env={"obs_size": 16, "max_steps": 10})
@@ -33,18 +32,6 @@ def worker(folder, figures, code=""):
 
 def calls(folder):
     return (folder / "calls").read_text().split()
-
-
-@pytest.mark.slow
-def test_the_figures_of_a_task(monkeypatch):
-    monkeypatch.setattr(soak, "SAMPLES", 8)  # each collects the garbage of the whole test session
-    figures = soak.soak(JOB)
-    assert figures.job == JOB
-    assert figures.episodes >= 6
-    assert figures.expert_success > 0.5
-    assert figures.faults == figures.clients_left == 0
-    assert figures.memory_mb > 50
-    assert abs(figures.memory_growth) < 0.1
 
 
 def test_complete_tasks_are_not_measured_again(tmp_path, figures):

@@ -27,28 +27,21 @@ from ba_torchrl.training.checkpoint import (
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from tests.planted import Planted
+from tests.training.test_interruption import SAC
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 TINY = {
-    "task": TASK,
+    **SAC,
     "env": ENV,
-    "algorithm": {
-        "name": "sac",
-        "batch_size": 4,
-        "replay": {"name": "prioritized", "capacity": 50},
-    },
-    "network": {"name": "cnn", "width": 0.125},
     "num_envs": 1,
-    "parallel": False,
     "demonstrations": 1,
+    "pretrain_updates": 0,
     "total_updates": 9,
+    "updates_per_step": 1,
     "min_replay": 2,
     "eval_every": 2,
     "eval_episodes": 1,
     "final_eval_episodes": 1,
-    "log_every": 1,
-    "video_episodes": 0,
-    "device": "cpu",
 }
 SIDECARS = ("other.pickle", "pickle.pkl", "prefetch.pkl", "state.pt", "transform.t", "frames.pt")
 

@@ -17,7 +17,6 @@ import ba_torchrl
 from ba_torchrl.commands import evaluate
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import RunResult, TestedPolicy, read_result
-from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import evaluation, protocol
 from ba_torchrl.training import policy as policies
@@ -195,16 +194,6 @@ def test_a_file_acts_like_the_run(run, tmp_path):
         assert getattr(card, name) == getattr(result, name), name
     assert again.env_config == policy.env_config
     assert str(run) not in path.with_suffix(".json").read_text()
-
-
-def test_wilson_interval():
-    """(p + z^2 / 2n +- z sqrt(p (1 - p) / n + z^2 / 4n^2)) / (1 + z^2 / n)."""
-    n, p, z = 50, 0.9, 1.959964
-    centre, scale = p + z**2 / (2 * n), 1 + z**2 / n
-    half = z * (p * (1 - p) / n + z**2 / (4 * n**2)) ** 0.5
-    expected = (centre - half) / scale, (centre + half) / scale
-    assert wilson(0.9, 50)[1:] == pytest.approx(expected, abs=1e-6)
-    assert wilson(1.0, 50).low < 1
 
 
 def test_what_is_no_policy_is_named(run, tmp_path):

@@ -19,27 +19,13 @@ from ba_torchrl.training.checkpoint import (
 )
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
+from tests.training import test_experiment
 
 TINY = {
-    "task": "close_loop/block_reaching",
-    "env": {"obs_size": 64, "max_steps": 8},
-    "algorithm": {
-        "name": "sac",
-        "batch_size": 8,
-        "replay": {"name": "prioritized"},
-        "rotation": {"name": "sampled"},
-    },
-    "network": {"name": "cnn", "width": 0.25},
-    "num_envs": 2,
-    "parallel": False,
-    "demonstrations": 3,
-    "pretrain_updates": 2,
+    **test_experiment.TINY,
     "total_updates": 9,
-    "min_replay": 5,
-    "eval_every": 3,
     "eval_episodes": 2,
     "final_eval_episodes": 2,
-    "log_every": 1,
     "video_episodes": 0,
 }
 FERM = {

@@ -98,13 +98,6 @@ def assert_consistent(batch):
         assert error.abs().max() < 1e-3, key
 
 
-def test_the_tables_hold_every_storage_and_writer_of_torchrl():
-    elsewhere = {"Storage", "StorageEnsemble", "TensorStorage", "StoreStorage"}  # it needs a server
-    assert {*storages.__all__} - elsewhere == {*STORAGES} - OURS
-    elsewhere = {"Writer", "WriterEnsemble", "ImmutableDatasetWriter"}
-    assert {*writers.__all__} - elsewhere == {*WRITERS} - OURS
-
-
 @pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized")
 @pytest.mark.parametrize("kind", [ReplayBuffer, TensorDictReplayBuffer])
 @pytest.mark.parametrize(("storage", "writer", "sampler"), ROWS)

@@ -8,7 +8,6 @@ from typing import ClassVar
 import pytest
 import torch
 from fake_env import FakeEnv, act, assert_lost, assert_stepped
-from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv, StepCounter, TransformedEnv, check_env_specs
 
 import ba_torchrl
@@ -179,25 +178,6 @@ class TestWithTheRestOfTorchRL:
             assert not hasattr(env, "no_such_name")
         finally:
             env.close()
-
-    def test_a_collector_survives_a_kill(self, make_fakes):
-        env = make_fakes(2, horizon=5)
-        collector = Collector(env, None, frames_per_batch=20, total_frames=60)
-        batches = []
-        for batch in collector:
-            batches.append(batch.clone())
-            if len(batches) == 1:
-                os.kill(env.worker_pids[0], signal.SIGKILL)
-        collector.shutdown()
-        data = torch.cat(batches, 1)
-        assert data.batch_size == (2, 30)
-        faults = data["next", "fault"].squeeze(-1)
-        assert faults.sum(1).tolist() == [1, 0]
-        assert faults[0].nonzero().item() == 10
-        assert data["next", "truncated"].squeeze(-1)[faults].all()
-        # After the fault the episode starts from its first frame.
-        assert data["step_count"][0, 11].item() == 0
-        assert data["step_count"][1].flatten().tolist() == [0, 1, 2, 3, 4] * 6
 
     @pytest.mark.slow
     def test_spawn(self, make_fakes):

@@ -6,7 +6,6 @@ import numpy as np
 import pybullet
 import pytest
 
-import ba_torchrl
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.geometry import downward
@@ -432,27 +431,3 @@ def test_random_actions_keep_blocks_in_place_and_repeat_bit_by_bit(name):
             assert all(math.dist(block.position[:2], (0.45, 0.0)) < 0.35 for block in blocks)
     assert np.isfinite(traces[0]).all()
     assert all(trace == traces[0] for trace in traces[1:])
-
-
-EXPERTS = [
-    ("picking", {}),
-    *(
-        pytest.param(task, variant, marks=pytest.mark.slow)
-        for task in ("reaching", "picking", "pushing", "pulling")
-        for variant in ({}, {"random_orientation": False, "action_sequence": "pxyz"})
-    ),
-]
-
-
-@pytest.mark.parametrize(("task", "variant"), EXPERTS)
-@pytest.mark.parametrize("robot", slow_except_two_robots())
-def test_experts_succeed_with_every_robot(robot, task, variant):
-    env = ba_torchrl.make(
-        f"close_loop/block_{task}", robot=robot, expert=True, seed=0, obs_size=16, **variant
-    )
-    act = lambda td: td.set("action", td["expert_action"])  # noqa: E731
-    episodes = [env.rollout(50, act) for _ in range(5)]
-    faults = env.faults
-    env.close()
-    assert faults == 0
-    assert all(episode["next", "success"][-1] for episode in episodes)
