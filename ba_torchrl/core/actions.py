@@ -50,12 +50,22 @@ def wrap_angle(angle_rad: float, period_rad: float = 2 * math.pi) -> float:
     return (angle_rad + half) % period_rad - half
 
 
-def _indices(sequence: str, wanted: str) -> list[int]:
-    return [i for i, letter in enumerate(sequence) if letter == wanted]
+class _Sequence:
+    sequence: str
+
+    @property
+    def size(self) -> int:
+        """Number of components."""
+        return len(self.sequence)
+
+    @property
+    def turns(self) -> list[int]:
+        """Indices of the components that turn the gripper."""
+        return [i for i, letter in enumerate(self.sequence) if letter == "r"]
 
 
 @dataclass(frozen=True)
-class CloseLoopActions:
+class CloseLoopActions(_Sequence):
     """The close-loop action vector: components in [-1, 1] in the order of ``sequence``.
 
     Args:
@@ -80,19 +90,9 @@ class CloseLoopActions:
             )
 
     @property
-    def size(self) -> int:
-        """Number of components."""
-        return len(self.sequence)
-
-    @property
     def components(self) -> list[str]:
         """Name of each component: p, x, y, z or rz."""
         return ["rz" if letter == "r" else letter for letter in self.sequence]
-
-    @property
-    def turns(self) -> list[int]:
-        """Indices of the components that turn the gripper."""
-        return _indices(self.sequence, "r")
 
     @property
     def primitive(self) -> None:
@@ -153,7 +153,7 @@ class GridAxis(NamedTuple):
 
 
 @dataclass(frozen=True)
-class OpenLoopActions:
+class OpenLoopActions(_Sequence):
     """The open-loop action vector: a pose to pick from or place at, in metres and radians.
 
     Args:
@@ -184,25 +184,15 @@ class OpenLoopActions:
             )
 
     @property
-    def size(self) -> int:
-        """Number of components."""
-        return len(self.sequence)
-
-    @property
     def components(self) -> list[str]:
         """Name of each component: p, x, y, z, rz, ry or rx."""
         angles = iter(ANGLES[self.sequence.count("r")])
         return [next(angles) if letter == "r" else letter for letter in self.sequence]
 
     @property
-    def turns(self) -> list[int]:
-        """Indices of the components that turn the gripper."""
-        return _indices(self.sequence, "r")
-
-    @property
     def primitive(self) -> int | None:
         """Index of the primitive; None if there is none."""
-        return next(iter(_indices(self.sequence, "p")), None)
+        return self.sequence.index("p") if "p" in self.sequence else None
 
     @property
     def ranges(self) -> list[tuple[float, float]]:

@@ -19,7 +19,7 @@ from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
-from ba_torchrl.objectives.imitation import ActionDistance, action_distance
+from ba_torchrl.objectives.distance import ActionDistance, action_distance
 
 
 class SACfDLoss(TransitionLoss):

@@ -9,11 +9,8 @@ from torchrl.modules import TanhNormal
 
 from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
-from ba_torchrl.objectives.imitation import (
-    BehaviourCloningLoss,
-    LevelCrossEntropyLoss,
-    action_distance,
-)
+from ba_torchrl.objectives.distance import action_distance
+from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
 from tests.linear_sac import batch
 
 

@@ -8,7 +8,7 @@ from pydantic import Field
 
 from ba_torchrl.core.config import Part
 from ba_torchrl.demonstrations.episodes import EpisodeAssembler
-from ba_torchrl.objectives.imitation import ActionDistance
+from ba_torchrl.objectives.distance import ActionDistance
 
 
 class _Behaviour(Part):
