@@ -33,6 +33,7 @@ TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 TINY = {
     **SAC,
     "env": ENV,
+    "algorithm": {**SAC["algorithm"], "replay": {"name": "prioritized", "capacity": 50}},
     "num_envs": 1,
     "demonstrations": 1,
     "pretrain_updates": 0,
