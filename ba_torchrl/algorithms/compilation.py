@@ -56,9 +56,6 @@ class CompiledLoss:
         mode: of `torch.compile`.
         function: the loss of a batch: a method of the module, or by default the module itself,
             which is then compiled in place.
-
-    Raises:
-        ConfigError: the system has no compiler.
     """
 
     def __init__(

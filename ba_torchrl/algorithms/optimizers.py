@@ -93,9 +93,6 @@ class Optimizers(OptimizationStepper):
 
         Returns:
             The results of all stages, without gradient.
-
-        Raises:
-            ValueError: the losses of a stage have different optimisers.
         """
         is_update = isinstance(trainer, Update)
         taken, is_finite, condition = TensorDict(), True, None
@@ -134,9 +131,6 @@ class Optimizers(OptimizationStepper):
             terms: names of the terms.
             condition: bool scalar on the parameters' device, False for a step that changes nothing;
                 None for True.
-
-        Raises:
-            ValueError: the terms have different optimisers.
         """
         optimizers = self.of(terms)
         for optimizer in optimizers:

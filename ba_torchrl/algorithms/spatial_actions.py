@@ -19,11 +19,7 @@ from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
 def make_spatial_values(
     network: NetworkConfig, problem: Problem, images: Mapping[str, ImageSpec]
 ) -> SpatialValues:
-    """Return a freshly initialised network, wrapped as values of the environment's actions.
-
-    Raises:
-        ValueError: the network does not support the images or the actions.
-    """
+    """Return a freshly initialised network, wrapped as values of the environment's actions."""
     actions = problem.actions
     assert isinstance(actions, OpenLoopActions), "spatial networks are for open_loop tasks"
     spec = SpatialSpec(

@@ -68,9 +68,6 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
 
         Returns:
             Its index [1], or an empty tensor [0] for a fault.
-
-        Raises:
-            ReplaySchemaError: entries, types or shapes are not those of the stored ones.
         """
         return self.extend(data.unsqueeze(0))
 

@@ -80,9 +80,6 @@ class ImageCodecs(Transform):
             them itself.
         device: to which images are copied before they are decoded; None to leave them where they
             are.
-
-    Raises:
-        ValueError: an image has values that its storage cannot represent.
     """
 
     def __init__(
