@@ -767,7 +767,7 @@ def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_
 
 def test_only_folders_of_ours_are_read_for_an_export(tmp_path):
     for path in (foreign(tmp_path / "a.hdf5"), tmp_path):
-        with pytest.raises(ConfigError, match="folders of `ba-torchrl collect` or `play`"):
+        with pytest.raises(ConfigError, match="that `ba-torchrl collect` or `teleoperate` wrote"):
             read_demonstrations(path)
 
 
