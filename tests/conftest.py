@@ -2,6 +2,7 @@ import contextlib
 import functools
 import multiprocessing
 import os
+import sys
 import threading
 
 import pytest
@@ -44,6 +45,14 @@ def no_process_outlives_the_tests():
     yield
     for process in multiprocessing.active_children():
         process.kill()
+
+
+@pytest.fixture(autouse=True)
+def no_folder_stays_on_the_path():
+    """Commands add the present folder, whose modules later tests would find."""
+    before = list(sys.path)
+    yield
+    sys.path[:] = before
 
 
 @pytest.fixture
