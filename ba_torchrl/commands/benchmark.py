@@ -80,13 +80,15 @@ def main(task: Task) -> None:
     launcher = choose(LAUNCHERS, config.launcher, "launcher")
     launcher.check(runs)
     # the runs end with this process
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     grid = Grid(runs, Path(config.folder), config.jobs, config.max_hours)
     try:
         failures = launcher.run_all(grid)
     except (KeyboardInterrupt, SystemExit):
         sys.stderr.write("the same command continues the grid\n")
         raise
+    finally:
+        signal.signal(signal.SIGTERM, before)
     states = {run.run_dir: status(run) for run in runs}
     done = sum(state.state == "done" for state in states.values())
     print(f"{done} of {len(runs)} runs done in {config.folder}")

@@ -102,6 +102,8 @@ def _write_shared_entries(seed):
 def test_concurrent_writes_leave_valid_entries(own_cache):
     with multiprocessing.get_context("fork").Pool(6) as pool:
         found = pool.map_async(_write_shared_entries, range(60), chunksize=1).get(timeout=240)
+        pool.close()
+        pool.join()  # the end of the context sends a signal, which a new process can miss
     assert set(found) == {0.0}
     assert len(list(own_cache.rglob("*.npz"))) == 3
     assert not list(own_cache.rglob("*.tmp"))

@@ -169,6 +169,8 @@ def test_size_and_position_of_a_mesh_do_not_change_its_shape(tmp_path, scale, of
     # in a process of its own: an offset of 5e6 m ends one that decomposes as it is
     with multiprocessing.get_context("fork").Pool(1) as pool:  # daemonic, as workers are
         shape = pool.apply_async(load, (tmp_path, mesh)).get(timeout=240)
+        pool.close()
+        pool.join()
     extents = np.ptp(shape.mesh().vertices, axis=0)
     np.testing.assert_allclose(extents / extents[0], (1.0, 1.0, 2 / 3), rtol=0.02)
     fill = volume(shape) / extents.prod()
