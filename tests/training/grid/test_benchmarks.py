@@ -35,8 +35,10 @@ def shipped(name, *overrides):
 
 SLOW = pytest.mark.slow
 GRIDS = [
+    ("architectures", 1, 5),
     ("close_loop_small", 1, 13),
     ("cpu_six_dof", 9, 9),
+    ("demonstrations", 2, 8),
     ("equivariance", 3, 9),
     ("imitation", 2, 12),
     pytest.param("close_loop_3d", 10, 170, marks=SLOW),
