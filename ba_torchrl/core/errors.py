@@ -10,13 +10,17 @@ import shlex
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 
+_LISTED_BY = {"task": "`ba-torchrl tasks` and ba_torchrl.list_tasks() list them"}
+"""By kind of name, what is written in place of many names."""
+
 
 class ConfigError(ValueError):
     """A configuration that cannot be used; the message says what is allowed."""
 
 
 class UnknownNameError(ConfigError, KeyError):
-    """A name that is not among the known ones; the message lists them, the nearest one first.
+    """A name that is not among the known ones; the message has the nearest one, and lists them or
+    says what lists them.
 
     Args:
         kind: of what is named, such as "task".
@@ -33,10 +37,20 @@ class UnknownNameError(ConfigError, KeyError):
         last = str(self.name).rpartition(".")[2]
         word = re.compile(rf"(^|[_/.]){re.escape(last)}($|[_/.])")
         close = [each for each in self.known if word.search(each)][:3]
-        close = close or difflib.get_close_matches(last, self.known, n=1)
+        close = close or self._nearest(last)
         meant = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
-        known = ", ".join(self.known)
-        return f"unknown {self.kind} {self.name!r}.{meant} Known: {known}{self.hint}"
+        known = _LISTED_BY.get(self.kind, f"Known: {', '.join(self.known)}")
+        return f"unknown {self.kind} {self.name!r}.{meant} {known}{self.hint}"
+
+    def _nearest(self, name: str) -> list[str]:
+        """Return the most similar known name, of several the one with most letters in place."""
+
+        def likeness(other: str) -> tuple[float, int]:
+            ratio = difflib.SequenceMatcher(None, other, name).ratio()
+            return ratio, sum(map(str.__eq__, other, name))
+
+        near = difflib.get_close_matches(name, self.known, n=5)
+        return [max(near, key=likeness)] if near else []
 
 
 class SettingsError(ConfigError):

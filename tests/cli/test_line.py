@@ -112,7 +112,11 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
         (["train", "algorithm=sacd"], "unknown algorithm 'sacd'. Did you mean 'sacfd'?"),
         (["train", "algorithm.name=sacd", "run_dir=x"], "unknown algorithm 'sacd'. Did you mean"),
         (["train", "replay=pre"], "unknown replay 'pre'. Did you mean 'per'?"),
-        (["train", "task=close_loop/block_pickng"], "Did you mean 'close_loop/block_picking'?"),
+        (["train", "network=cnm"], "unknown network 'cnm'. Did you mean 'cnn'?"),
+        (
+            ["train", "task=close_loop/block_pickng"],
+            "Did you mean 'close_loop/block_picking'? `ba-torchrl tasks` and",
+        ),
         (["train", "+seed=1", "run_dir=x"], "An item is already at 'seed'"),
         (["train", "env.workspace=[1,2"], "cannot read 'env.workspace=[1,2'"),
         (["train", "block_picking"], "'block_picking' sets nothing; settings are FIELD=VALUE"),

@@ -244,7 +244,7 @@ FERM = {
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"task": "close_loop/flying"}, "Known: .*block_picking"),
+        ({"task": "close_loop/flying"}, "unknown task 'close_loop/flying'"),
         ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
         ({"env": {"seed": 3}}, "set by the experiment"),
         ({"env": {"obs_type": "vec"}}, "obs_type"),
