@@ -165,8 +165,8 @@ class SO2Augmentation(SeededTransform):
 
     The reference implementation stores four rotated copies with each transition; on sampled
     transitions, a probability of 0.8 has nearly the same effect without the memory. The gripper, z
-    and yaw components and images with the gripper's axes are unchanged. Each call on the same batch
-    draws new angles.
+    and yaw components and images with the gripper's axes are unchanged, and so are vectors such as
+    ``proprio``, which do not fit the rotated images. Each call on the same batch draws new angles.
 
     Args:
         images: declarations of the images by key.
@@ -175,8 +175,8 @@ class SO2Augmentation(SeededTransform):
         probability: of rotating a transition.
 
     Raises:
-        ValueError: the probability is outside [0, 1], x or y is missing, or an image cannot be
-            rotated.
+        ValueError: the probability is outside [0, 1], x or y is missing, the images are those of an
+            open-loop task, or an image cannot be rotated.
     """
 
     def __init__(
@@ -191,6 +191,8 @@ class SO2Augmentation(SeededTransform):
             raise ValueError(f"probability must be in [0, 1], got {probability}")
         if not {"x", "y"} <= set(action_sequence):
             raise ValueError(f"the action {action_sequence!r} has no x and y to rotate")
+        if keys.HEIGHTMAP in images:
+            raise ValueError("x and y of open-loop actions are positions: use RigidAugmentation")
         require_known_frames(images)
         scene_images = [key for key, image in images.items() if image.frame == "scene"]
         super().__init__([*image_pairs(scene_images), keys.ACTION], seed)

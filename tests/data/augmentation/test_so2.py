@@ -192,6 +192,8 @@ def test_invalid_arguments_are_refused():
         SO2Augmentation(IMAGES, "pxyz", seed=0, probability=1.5)
     with pytest.raises(ValueError, match="no x and y"):
         SO2Augmentation(IMAGES, "pz", seed=0)
+    with pytest.raises(ValueError, match="use RigidAugmentation"):
+        SO2Augmentation({"heightmap": ImageSpec(1, 32, 0.4)}, "pxyr", seed=0)
 
 
 def test_each_transition_is_followed_by_its_rotated_copies():
