@@ -1,4 +1,4 @@
-"""Environments, demonstrations, replay and augmentation do not depend on torch's defaults."""
+"""What does not depend on torch's defaults: environments, demonstrations, replay, policies."""
 
 import pytest
 import torch
@@ -25,6 +25,7 @@ CASES = [
     ("open_loop/house_building_1", {"rgb": True, "point_cloud": 64}),
     ("open_loop/house_building_1", source_config("deconstruction")),
 ]
+POLICIES = ["close_loop/corner_picking", "open_loop/house_building_1", "ramp/block_stacking"]
 
 
 @pytest.fixture(params=SETTERS)
@@ -65,6 +66,24 @@ def test_environments_fulfil_their_specs(expected, other_default, case):
     ):
         check_env_specs(env, break_when_any_done="both", seed=0)
         env.close()
+
+
+@pytest.fixture(scope="module")
+def expected_actions():
+    return {task: actions_of_policy(task) for task in POLICIES}
+
+
+def actions_of_policy(task):
+    policy = ba_torchrl.load_policy(task)
+    env = policy.make_env(seed=0)
+    actions = env.rollout(2, policy)[keys.ACTION]
+    env.close()
+    return actions
+
+
+@pytest.mark.parametrize("task", POLICIES)
+def test_policies_are_loaded_and_act(expected_actions, other_default, task):
+    assert torch.equal(actions_of_policy(task), expected_actions[task])
 
 
 def samples(task):

@@ -51,7 +51,7 @@ from ba_torchrl.core.plugins import check_known
 from ba_torchrl.record.results import CONFIG_FILE, RESULT_FILE, differences
 from ba_torchrl.tasks.base import Versions, versions_of
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_to_load
 from ba_torchrl.training.state import RunState
 
 logger = logging.getLogger(__name__)
@@ -395,7 +395,7 @@ def load(
     """
     checkpoint = find_checkpoint(path, which)
     config = read_config(checkpoint.parent.parent, **changes)
-    algorithm = build_algorithm(config)
+    algorithm = build_to_load(config)
     DurableCheckpoint(algorithm=algorithm).load(checkpoint)
     return config, algorithm
 

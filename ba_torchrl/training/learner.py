@@ -15,12 +15,27 @@ def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) ->
     `ConfigError` if task, algorithm and network do not go together."""
     problem = problem or problem_of(config)
     torch.manual_seed(config.seed)
+    return _build(config, problem)
+
+
+def build_to_load(config: ExperimentConfig) -> Learner:
+    """Build an algorithm whose weights will be replaced; torch's generators do not change."""
+    device = config.torch_device
+    with torch.device("cpu"), torch.random.fork_rng([device] if device.type == "cuda" else []):
+        return _build(config, problem_of(config))
+
+
+def _build(config: ExperimentConfig, problem: Problem) -> Learner:
+    dtype = torch.get_default_dtype()
+    torch.set_default_dtype(torch.float32)  # of the observations; escnn works in no other
     try:
         return config.algorithm_config.build(config.network_config, problem)
     except ConfigError:
         raise
     except ValueError as error:  # sizes and components that a network does not take
         raise ConfigError(str(error)) from error
+    finally:
+        torch.set_default_dtype(dtype)
 
 
 def problem_of(config: ExperimentConfig) -> Problem:

@@ -46,7 +46,7 @@ from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 from ba_torchrl.training.checkpoint import Which, find_checkpoint, load, parse_saved, read_versions
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_to_load
 from ba_torchrl.training.precision import precision
 from ba_torchrl.training.protocol import PROTOCOL, count_parameters
 
@@ -230,7 +230,8 @@ class TrainedPolicy(TensorDictModuleBase):
         device = next(self.parameters()).device
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
             found = self.policy(tensordict.select(*self.in_keys).to(device))[keys.ACTION]
-        return tensordict.set(keys.ACTION, found.to(tensordict.device or found.device))
+        action = found.to(tensordict.device or found.device, torch.float32)
+        return tensordict.set(keys.ACTION, action)
 
     def _check_observed(
         self, wanted: Iterable[NestedKey], observed: Mapping[NestedKey, torch.Size]
@@ -296,7 +297,7 @@ def load_policy(
     card = read_card(path)
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
     config = parse_saved(card.config, path.with_suffix(CARD), **changes)
-    learner = build_algorithm(config)
+    learner = build_to_load(config)
     try:
         learner.policy.load_state_dict(load_file(path, device=str(config.torch_device)))
     except (OSError, RuntimeError, SafetensorError) as error:

@@ -167,6 +167,22 @@ def test_any_batch_shape_is_taken(shipped):
     torch.testing.assert_close(batch, action.expand(2, 3, -1))
 
 
+def test_loading_leaves_the_draws_of_torch_alone(run):
+    torch.manual_seed(5)
+    expected = torch.rand(3)
+    for source in (run, "close_loop/block_picking"):
+        torch.manual_seed(5)
+        ba_torchrl.load_policy(source)
+        assert torch.equal(torch.rand(3), expected)
+        assert torch.initial_seed() == 5
+
+
+def test_actions_have_the_type_of_the_environments_under_autocast(shipped):
+    for policy in shipped.values():
+        with closing(policy.make_env(seed=0)) as env, torch.autocast("cpu", torch.bfloat16):
+            env.rollout(1, policy)
+
+
 def test_a_file_acts_like_the_run(run, tmp_path):
     policy = ba_torchrl.load_policy(run)
     trained = [weight.clone() for weight in policy.policy.state_dict().values()]

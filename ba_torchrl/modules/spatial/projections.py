@@ -203,7 +203,7 @@ def _occupied(columns: Tensor, dim: int) -> Tensor:
     """
     size = columns.shape[-1]
     along = columns if dim == -1 else columns.transpose(-2, -1)
-    histogram = torch.zeros(*along.shape[:-1], size + 1, device=along.device)
+    histogram = torch.zeros(*along.shape[:-1], size + 1, dtype=torch.float32, device=along.device)
     histogram.scatter_add_(-1, along, torch.ones_like(along, dtype=torch.float32))
     # level k is occupied in the columns that have more than k voxels
     return histogram.flip(-1).cumsum(-1).flip(-1)[..., 1:]

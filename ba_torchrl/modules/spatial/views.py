@@ -28,7 +28,7 @@ def sampling_grid(center_px: Tensor, yaw_rad: Tensor, size: int, image_size: int
     Returns:
         [N, size, size, 2], column then row; -1 and 1 are the outer edges of the image.
     """
-    offsets = torch.arange(size, device=center_px.device) - (size - 1) / 2
+    offsets = torch.arange(size, dtype=center_px.dtype, device=center_px.device) - (size - 1) / 2
     along, across = torch.meshgrid(offsets, offsets, indexing="ij")
     cos, sin = yaw_rad.cos()[:, None, None], yaw_rad.sin()[:, None, None]
     rows = center_px[:, 0, None, None] + cos * along - sin * across
