@@ -94,7 +94,7 @@ class Registry(Generic[T]):
         self._scan()
         try:
             return self._entries[name]
-        except KeyError:
+        except (KeyError, TypeError):  # a list is not hashable
             hint = (
                 ". Entries from outside the package are known once their module is imported "
                 "(recipes: 'plugins=[module]'; worker processes: register_modules=[module])"

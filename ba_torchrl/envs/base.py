@@ -17,7 +17,7 @@ from torchrl.envs.utils import _classproperty
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.envs.checks import ChecksPolicy, checked_action
+from ba_torchrl.envs.checks import ChecksPolicy, check_seed, checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_bodies, check_observation
 from ba_torchrl.envs.observations import (
@@ -306,9 +306,10 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     # -- TorchRL -----------------------------------------------------------------------------
 
     def _set_seed(self, seed: int | None) -> None:
-        self.base_seed = int(
-            np.random.SeedSequence().generate_state(1)[0] if seed is None else seed
-        )
+        if seed is None:
+            seed = np.random.SeedSequence().generate_state(1)[0]
+        check_seed(seed)
+        self.base_seed = int(seed)
         self._episode = 0
 
     def _reset(
@@ -318,7 +319,6 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         seed: int | None = None,
         set_state: bool = False,
         state: TensorDictBase | None = None,
-        **_: Any,
     ) -> TensorDict:
         if set_state:
             return self._set_state(tensordict if state is None else state)

@@ -1,4 +1,4 @@
-"""Validation of actions before they are executed, and of policies before they act."""
+"""Validation of actions before they are executed, of policies before they act, and of seeds."""
 
 from __future__ import annotations
 
@@ -29,6 +29,12 @@ def check_policy(policy: Any, env: EnvBase) -> None:
     """Let a policy with the method ``check_env``, such as `TrainedPolicy`, check an environment."""
     if hasattr(policy, "check_env"):
         policy.check_env(env)
+
+
+def check_seed(seed: int) -> None:
+    """Check that a seed is a natural number."""
+    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
+        raise ValueError(f"a seed must be a natural number, got {seed!r}")
 
 
 def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: str) -> np.ndarray:

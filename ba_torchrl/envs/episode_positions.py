@@ -110,6 +110,9 @@ class RecordedPosition:
             restored = super()._reset(tensordict, set_state=True, **options)
             self._played = self._resumed = None
             return restored
+        mask = None if tensordict is None else tensordict.get("_reset", None)
+        if mask is not None and not mask.any() and self._observation:
+            return self._tensordict(self._observation, **self._ends)
         if self._resumed is not None and seed is None:
             resumed, self._resumed = self._resumed, None
             return resumed

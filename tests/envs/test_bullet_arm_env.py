@@ -4,6 +4,7 @@ import copy
 import pickle
 from functools import partial
 
+import numpy as np
 import pybullet
 import pytest
 import torch
@@ -192,6 +193,28 @@ def test_collectors_reset_each_environment_on_its_own():
             if not done[t]:
                 assert torch.equal(row["depth"][t + 1], row["next", "depth"][t])
         assert max(counts) <= 7
+
+
+@pytest.mark.parametrize("seed", [-1, 1.5, True, "3"])
+def test_a_seed_that_is_none_is_refused_before_it_is_set(env, seed):
+    expected = env.reset(seed=3)["depth"]
+    for set_it in (env.set_seed, lambda seed: env.reset(seed=seed)):
+        with pytest.raises(ValueError, match="natural number"):
+            set_it(seed)
+    assert env.base_seed == 3
+    assert torch.equal(env.reset(seed=np.int64(3))["depth"], expected)
+
+
+def test_a_misspelt_keyword_of_a_reset_is_an_error(env):
+    with pytest.raises(TypeError, match="'sed'"):
+        env.reset(sed=3)
+
+
+def test_a_reset_of_none_changes_nothing(env):
+    state = env.rand_step(env.reset())["next"].exclude("reward")
+    after = env.reset(state.clone().set("_reset", torch.zeros(1, dtype=torch.bool)))
+    assert torch.equal(after["depth"], state["depth"])
+    assert env.rand_step(after)["next", "step_count"] == 2
 
 
 def test_expert_key_only_on_request(env):

@@ -7,13 +7,12 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torchrl.envs import EnvBase
 from typing_extensions import Self
 
-from ba_torchrl.envs.checks import ChecksPolicy, check_actions
+from ba_torchrl.envs.checks import ChecksPolicy, check_actions, check_seed
 from ba_torchrl.envs.episode_positions import EpisodePosition
 
 MakeEnv = Callable[[], EnvBase]
@@ -250,9 +249,3 @@ class SerialVectorEnv(Vector):
     def _get_each(self, name: str) -> tuple[list[Any], bool]:
         values = [getattr(env, name) for env in self._envs]
         return values, callable(values[0])
-
-
-def check_seed(seed: int) -> None:
-    """Check that a seed is a natural number."""
-    if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
-        raise ValueError(f"a seed must be a natural number, got {seed!r}")
