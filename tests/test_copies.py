@@ -234,8 +234,10 @@ SLOW += [
     "learner, sac ferm",
     "learner, rlpd equi",
     "learner, bc equi",
+    "learner, spatial_q equi_deictic_asr",
     "policy, CNN",
     "policy, ASR",
+    "policy, Equi ASR",
 ]
 
 

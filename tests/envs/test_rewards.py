@@ -69,7 +69,7 @@ def test_progress_rises_to_success_along_the_experts_episodes(make, task):
     size = {"obs_type": "vec"} if task.startswith("close_loop") else {"obs_size": 128}
     env = make(task, reward="dense", **size)
     thirds, random_means = [], []
-    for seed in SEEDS:
+    for seed in SEEDS[:2]:
         env.reset(seed=seed)
         first = env.scene.task.progress()
         _, steps = play(env, seed, expert=True)

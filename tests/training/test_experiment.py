@@ -78,7 +78,8 @@ def test_a_run_writes_its_files(tmp_path):
     assert find_checkpoint(folder).name.endswith("6")
 
 
-@pytest.mark.parametrize("parallel", [False, pytest.param(True, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("parallel", [False, True])
 def test_runs_of_one_seed_are_equal_and_of_two_differ(tmp_path, parallel):
     def losses(name, seed):
         config = tiny(
@@ -86,8 +87,8 @@ def test_runs_of_one_seed_are_equal_and_of_two_differ(tmp_path, parallel):
             seed=seed,
             parallel=parallel,
             start_method="fork",
-            video_episodes=0,
             threads=1,
+            **{**SHORT, "total_updates": 4},
         )
         Experiment(config, progress=False).run()
         return read_scalars(tmp_path / name / "run")["train/loss_qvalue"].values.tolist()
@@ -366,16 +367,18 @@ OPEN_LOOP = {
 }
 
 
-@pytest.mark.parametrize("source", ["expert", "deconstruction"])
+@pytest.mark.parametrize(
+    "source", ["deconstruction", pytest.param("expert", marks=pytest.mark.slow)]
+)
 def test_an_open_loop_run_from_either_source(tmp_path, source):
-    config = tiny(tmp_path, **OPEN_LOOP, demonstrations_source=source)
+    config = tiny(tmp_path, **OPEN_LOOP, **SHORT, demonstrations_source=source)
     result = Experiment(config, progress=False).run()
-    assert result.updates == 6
-    assert result.last.episodes == 4
+    assert result.updates == 3
+    assert result.last.episodes == 1
     scalars = read_scalars(tmp_path / "run")
     assert scalars["demonstrations/success_rate"].values == [1.0]
     _, algorithm = load(tmp_path / "run")
-    assert algorithm.updates == 6
+    assert algorithm.updates == 3
 
 
 @pytest.mark.parametrize(
@@ -395,8 +398,7 @@ def test_rotation_is_refused_for_views_that_do_not_rotate_with_the_scene(tmp_pat
     with pytest.raises(ConfigError, match=r"depth does not rotate.*use rotation.name=none"):
         Experiment(tiny(tmp_path, env=env), progress=False)
     plain = {**TINY["algorithm"], "rotation": {"name": "none"}}
-    config = tiny(tmp_path, env=env, algorithm=plain, **SHORT)
-    assert Experiment(config, progress=False).run().updates == 3
+    Experiment(tiny(tmp_path, env=env, algorithm=plain, **SHORT), progress=False).close()
 
 
 def test_seeds_of_different_uses_and_runs_differ(tmp_path):
@@ -414,7 +416,8 @@ def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
 
 
 def test_a_run_survives_a_worker_that_dies(tmp_path, monkeypatch):
-    config = tiny(tmp_path, parallel=True, start_method="fork", video_episodes=0, total_updates=12)
+    changes = {**SHORT, "total_updates": 10}
+    config = tiny(tmp_path, parallel=True, start_method="fork", **changes)
     experiment = Experiment(config, progress=False)
     store = experiment._store
     batches = 0

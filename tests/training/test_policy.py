@@ -259,7 +259,6 @@ def test_the_cards_of_shipped_policies_name_the_command_that_finds_them():
 
 QUICK = (
     "close_loop/block_picking",
-    "close_loop/drawer_opening",
     "open_loop/improvise_house_building_2",
 )
 

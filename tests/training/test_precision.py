@@ -81,7 +81,7 @@ def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog, monkeypatch
     [
         ({}, [6]),  # of six updates
         ({"total_updates": 2}, [2]),  # on the demonstrations alone
-        ({"log_every": 4}, [4]),
+        pytest.param({"log_every": 4}, [4], marks=pytest.mark.slow),
         pytest.param({"log_every": 6}, [6], marks=pytest.mark.slow),
         pytest.param({"log_every": 3}, [3, 6], marks=pytest.mark.slow),
         ({"stop_at_success": 1e-9, "eval_every": 1, "eval_episodes": 2}, [2]),

@@ -251,7 +251,7 @@ OPEN = {
 }
 
 
-@pytest.mark.parametrize("name", slow_except(OPEN, ["L without bottom", "truncated ball"]))
+@pytest.mark.parametrize("name", slow_except(OPEN, ["L without bottom"]))
 def test_an_open_surface_is_closed_and_reported(tmp_path, caplog, name):
     mesh, expected = OPEN[name]
     used = mesh.vertices[np.unique(mesh.faces)]

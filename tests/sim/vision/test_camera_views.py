@@ -87,7 +87,7 @@ def test_values_are_within_range_m(name, world):
     view = VIEWS[name]
     low, high = view.range_m(SETUP)
     assert -0.5 < low < high < 1.5
-    for _ in range(4):
+    for _ in range(2):
         bodies = [
             goal(),
             block(*rng.uniform((0.3, -0.15), (0.6, 0.15)), size=(0.04, 0.05, rng.uniform(0, 0.4))),
