@@ -152,19 +152,6 @@ def test_an_action_may_be_on_another_device():
     assert checked_action(action, "task", "pxy").tolist() == [0.5, 0.0, -0.5]
 
 
-def test_the_same_seed_gives_the_same_pixels_in_serial_and_parallel():
-    policy = lambda td: td.set("action", torch.full((2, 5), -0.4))  # noqa: E731
-    rollouts = []
-    for parallel in (True, False):
-        env = ba_torchrl.make_vector_env(
-            TASK, 2, parallel=parallel, start_method="fork", obs_size=16, seed=5
-        )
-        rollouts.append(env.rollout(6, policy, break_when_any_done=False))
-        env.close()
-    assert torch.equal(rollouts[0]["next", "depth"], rollouts[1]["next", "depth"])
-    assert not torch.equal(rollouts[0]["depth"][0, 0], rollouts[0]["depth"][1, 0])
-
-
 def test_repeated_faults_are_an_error(env, monkeypatch):
     monkeypatch.setattr(faults, "MAX_CONSECUTIVE_FAULTS", 2)
     monkeypatch.setattr("ba_torchrl.sim.control.close_loop.CloseLoopController.move_to", _fail)

@@ -57,13 +57,6 @@ def test_an_object_that_leaves_the_workspace_terminates_without_reward(make):
     assert ends == {"terminated": True, "done": True, "success": False, "reward": False}
 
 
-def test_the_bounding_box_check_is_stricter_than_the_point_check(make):
-    for check, valid in (("point", True), ("bounding_box", False)):
-        env = make("block_picking", workspace_check=check)
-        env.scene.task.block.place((0.45, 0.13, 0.025))
-        assert env.scene.task.is_valid() is valid
-
-
 @pytest.mark.parametrize("check", ["point", "bounding_box"])
 @pytest.mark.parametrize(
     ("position", "message"),

@@ -292,42 +292,6 @@ def test_the_vector_lists_gripper_cabinet_and_handle(make):
     np.testing.assert_allclose(vector[-4:], expected, atol=1e-5)
 
 
-def test_episodes_repeat_in_a_used_and_in_a_fresh_world(make):
-    def episode(env, seed):
-        state, seen, rng = env.reset(seed=seed), [], np.random.default_rng(seed)
-        while not state["done"] and len(seen) < 16:
-            action = state["expert_action"]
-            if len(seen) % 4 == 3:
-                action = torch.from_numpy(rng.uniform(-1, 1, 5).astype(np.float32))
-            state = env.step(state.set("action", action))["next"]
-            seen.append(state["depth"].clone())
-        scene = env.scene
-        return torch.stack(seen), scene.task.cabinet.travel_m, scene.robot.measured_joints()
-
-    def same(one, other):
-        return torch.equal(one[0], other[0]) and one[1:] == other[1:]
-
-    used, fresh = make(expert=True, obs_size=32), make(expert=True, obs_size=32)
-    first = {seed: episode(used, seed) for seed in range(8)}
-    assert same(episode(fresh, 7), first[7])
-    for seed in np.random.default_rng(0).permutation(8).tolist():
-        assert same(episode(used, seed), first[seed])
-
-
-def test_a_state_restores_the_travel_of_the_drawer(make):
-    env = make(expert=True)
-    state = env.reset()
-    while env.scene.task.cabinet.travel_m < 0.05:
-        state = env.step(state.set("action", state["expert_action"]))["next"]
-    kept, travel = env.get_state(), env.scene.task.cabinet.travel_m
-    handle = env.scene.task.handle_pose
-    env.reset()
-    assert env.scene.task.cabinet.travel_m == pytest.approx(0.0, abs=1e-6)
-    env.reset(kept, set_state=True)
-    assert env.scene.task.cabinet.travel_m == travel
-    assert env.scene.task.handle_pose == handle
-
-
 @pytest.mark.parametrize("scale", [0.85, 1.0, 1.4])
 def test_the_collision_surface_is_that_of_the_image(make, scale):
     """Rays hit floor, front and handle of the drawer, and the cabinet, at the rendered heights."""

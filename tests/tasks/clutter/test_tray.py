@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-import ba_torchrl
 from ba_torchrl.sim.shapes import Box, Decal
 from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.sim.world import World
@@ -99,12 +98,3 @@ def test_dropped_blocks_stay_in_the_tray(world):
     for block in blocks:
         assert 0.008 < block.position[2] < 0.08
         assert max(abs(p - c) for p, c in zip(block.position, CENTER, strict=False)) < 0.16
-
-
-def test_the_tray_is_an_option_of_close_loop_tasks():
-    env = ba_torchrl.make("close_loop/block_picking", close_loop_tray=True, seed=0, obs_size=32)
-    for _ in range(5):
-        env.reset()
-        assert {"tray floor", "tray walls"} <= {body.name for body in env.scene.world.bodies}
-        assert env.scene.task.block.position[2] == pytest.approx(0.025 + FLOOR_Z_M, abs=2e-3)
-    env.close()

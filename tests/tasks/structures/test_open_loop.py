@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import pytest
 
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
@@ -122,21 +121,6 @@ def test_every_episode_draws_its_shapes(make_started, name):
         assert len(task.objects) == task.num_objects
         drawn.add(tuple(body.name for body in task.objects[1:3]))
     assert len(drawn) > 8
-
-
-def test_a_state_restores_the_shapes(make_started):
-    scene = make_started("open_loop/improvise_house_building_3").scene
-    first, state = list(scene.task.objects), scene.get_state()
-    poses = [body.pose for body in first]
-    rng = np.random.default_rng(5)
-    scene.task.choose_objects(rng)
-    scene.task.initialize_episode(rng)
-    assert list(scene.task.objects) != first
-    scene.set_state(state)
-    assert list(scene.task.objects) == first
-    assert [body.pose for body in first] == poses
-    assert all(not body.is_hidden for body in first)
-    assert set(scene.task.structure.pieces) == set(first)
 
 
 # -- experts -----------------------------------------------------------------------------------
