@@ -26,7 +26,6 @@ OF_TRAINING = (
     "omegaconf",
     "matplotlib",
     "jinja2",
-    "imageio",
     "imageio-ffmpeg",
     "pillow",
 )

@@ -33,9 +33,8 @@ class Series(NamedTuple):
 
 
 def limit_library_logs() -> None:
-    """Set the log levels of libraries to warnings or errors."""
+    """Set the log levels of libraries to warnings."""
     logging.getLogger("torchrl").setLevel(logging.WARNING)
-    logging.getLogger("imageio_ffmpeg").setLevel(logging.ERROR)
 
 
 def progress_bar(**settings: Any) -> tqdm:

@@ -15,12 +15,16 @@ from ba_torchrl.core.files import replaced
 if TYPE_CHECKING:
     from ba_torchrl.envs.base import BulletArmEnv
 
-_GIF_COLORS = 128
-_PALETTE_STRIDE = 4
-"""Distance of the pixels from which the colours of a GIF are chosen."""
 _CAPTION_SIZE = 13
 _CAPTION_MARGIN = 6
 _CAPTION_RGB = (70, 70, 70)
+
+_OPTIONS = {
+    ".mp4": ("-vcodec", "libx264", "-pix_fmt", "yuv420p"),
+    # one palette for all frames, and no dither, halve the size
+    ".gif": ("-vf", "split[a][b];[a]palettegen=128[p];[b][p]paletteuse=dither=none", "-loop", "0"),
+}
+"""Of ffmpeg, by suffix. Colours of yuv420p have half of the resolution, hence even sizes."""
 
 
 class FrameRecorder:
@@ -67,53 +71,29 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
     The frames [H, W, 3] are uint8 of equal size. For ``.mp4``, an odd height or width is padded
     with a copy of the last row or column.
     """
-    import imageio
     import imageio_ffmpeg
 
     path = Path(path)
-    with replaced(path) as scratch:
-        if path.suffix.lower() == ".gif":
-            gif = _with_common_colors(frames)
-            options = {"format": "gif", "duration": 1000 / fps, "loop": 0}
-            scratch.write_bytes(imageio.mimwrite("<bytes>", gif, **options))
-        else:
-            _encode(imageio_ffmpeg.get_ffmpeg_exe(), list(map(_even, frames)), fps, scratch)
-    return path
-
-
-def _encode(program: str, pictures: Sequence[np.ndarray], fps: float, path: Path) -> None:
-    """Run ffmpeg, whose exit code imageio does not report.
-
-    yuv420p halves the resolution of chroma, hence even sizes.
-    """
+    suffix = path.suffix.lower()
+    pictures = list(frames) if suffix == ".gif" else list(map(_even, frames))
     height, width = pictures[0].shape[:2]
-    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps)]
-    target = ["-vcodec", "libx264", "-pix_fmt", "yuv420p", str(path)]
-    done = subprocess.run(
-        [program, "-y", "-v", "error", "-xerror", *source, "-i", "-", *target],
-        input=b"".join(picture.tobytes() for picture in pictures),
-        capture_output=True,
-        check=False,
-    )
-    if done.returncode:
-        lines = done.stderr.decode(errors="replace").splitlines() or ["no reason given"]
-        raise OSError(errno.EIO, f"ffmpeg: {lines[0].split('] ')[-1]}")
-
-
-def _with_common_colors(pictures: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return frames with `_GIF_COLORS` colours, which halves the size of a GIF."""
-    from PIL import Image
-
-    sample = np.vstack([picture[::_PALETTE_STRIDE, ::_PALETTE_STRIDE] for picture in pictures])
-    palette = Image.fromarray(sample).quantize(_GIF_COLORS, kmeans=2, dither=Image.Dither.NONE)
-    return [
-        np.asarray(
-            Image.fromarray(picture)
-            .quantize(palette=palette, dither=Image.Dither.NONE)
-            .convert("RGB")
+    source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps))
+    with replaced(path) as scratch:
+        # not by imageio, which does not report the exit code
+        done = subprocess.run(
+            [
+                *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-xerror"),
+                *(*source, "-i", "-"),
+                *(*_OPTIONS[suffix], str(scratch)),
+            ],
+            input=b"".join(picture.tobytes() for picture in pictures),
+            capture_output=True,
+            check=False,
         )
-        for picture in pictures
-    ]
+        if done.returncode:
+            lines = done.stderr.decode(errors="replace").splitlines() or ["no reason given"]
+            raise OSError(errno.EIO, f"ffmpeg: {lines[0].split('] ')[-1]}")
+    return path
 
 
 def _with_caption(picture: np.ndarray, text: str) -> np.ndarray:

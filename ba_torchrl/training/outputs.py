@@ -53,7 +53,7 @@ class Result:
 def check_packages(config: ExperimentConfig) -> None:
     """Raise `MissingPackageError` unless the packages are installed that the run needs when it
     ends."""
-    needed = ["matplotlib", *(("imageio", "imageio_ffmpeg") if config.video_episodes else ())]
+    needed = ["matplotlib", *(["imageio_ffmpeg"] if config.video_episodes else [])]
     if missing := [name.replace("_", "-") for name in needed if find_spec(name) is None]:
         what = "a run's curve and video need packages that are not installed"
         raise MissingPackageError(what, install_command(*missing))
