@@ -24,10 +24,9 @@ from ba_torchrl.record.leaderboard import (
     LEGEND,
     RECORDS,
     Leaderboard,
-    cell_text,
     leaderboard,
-    package_runs,
     read_records,
+    success_text,
 )
 from ba_torchrl.record.plots import save
 from ba_torchrl.record.report import plot_groups
@@ -82,13 +81,13 @@ def add(roots: Sequence[str]) -> int:
 def present() -> Leaderboard:
     """Return the package's records by task and method, tasks of plugins left out."""
     tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
-    return leaderboard(package_runs(completed), [], tasks, PROTOCOL)
+    return leaderboard(completed(read_records()), [], tasks, PROTOCOL)
 
 
 def questions() -> dict[str, Section]:
     """Return the records of each benchmark that answers a question, by its name."""
     return {
-        folder.name: Section(folder.name, grouped(read_records(folder, completed)))
+        folder.name: Section(folder.name, grouped(completed(read_records(folder))))
         for folder in sorted(FOLDER.iterdir())
         if folder.is_dir()
     }
@@ -127,7 +126,7 @@ def _compared_cells(group: Group, end: int) -> list[str]:
     return [
         f"`{group.task}`",
         group.method,
-        _unbroken(cell_text(group)),
+        _unbroken(success_text(group)),
         f"{group.area(end):.2f}",
         "–" if math.isnan(steps) else f"{steps:.0f}",
         _mean([run.result.seconds and run.result.seconds / 60 for run in group.runs]),
@@ -150,8 +149,8 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
         yield f"### {heading}\n"
         yield from pipes(HEADER, *(row for task in tasks for row in _rows(board, task)))
         yield ""
-    if board.cells:
-        yield _origin([run for group in board.cells.values() for run in group.runs])
+    if board.groups:
+        yield _origin([run for group in board.groups for run in group.runs])
 
 
 def plot_tasks(board: Leaderboard, path: Path) -> None:
@@ -174,8 +173,7 @@ def plot_tasks(board: Leaderboard, path: Path) -> None:
             score = describe(task).experts.get("kuka")
             if score:
                 axes.plot(score.success_rate, y, "|", color="0.4", markersize=9)
-            groups = [group for (of, _), group in board.cells.items() if of == task]
-            if groups:
+            if groups := board.of_task(task):
                 rate, low, high = max(group.success for group in groups)
                 axes.plot([low, high], [y, y], color="#0072B2", linewidth=1.5)
                 axes.plot(rate, y, "o", color="#0072B2", markersize=4)
@@ -188,7 +186,7 @@ def plot_tasks(board: Leaderboard, path: Path) -> None:
 def _rows(board: Leaderboard, task: str) -> Iterator[list[str]]:
     """Yield the rows of a task; numbers of several runs are means."""
     robot = "kuka"
-    groups = [group for (of, _), group in board.cells.items() if of == task]
+    groups = board.of_task(task)
     if not groups:
         score = describe(task).experts.get(robot)
         yield [f"`{task}`", f"{score.success_rate:.2f}" if score else "", *["–"] * 5]
@@ -199,7 +197,7 @@ def _rows(board: Leaderboard, task: str) -> Iterator[list[str]]:
             f"`{task}`",
             f"{score.success_rate:.2f}" if score else "",
             group.method,
-            _unbroken(cell_text(group)),
+            _unbroken(success_text(group)),
             _mean([result.last.mean_length for result in results], ".1f"),
             _mean([result.env_steps for result in results]),
             _mean([result.seconds and result.seconds / 60 for result in results]),

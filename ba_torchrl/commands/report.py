@@ -6,7 +6,10 @@ ba-torchrl report 'runs=[runs/close_loop_3d,runs/close_loop_4d]' folder=report a
 
 from __future__ import annotations
 
+import contextlib
 import functools
+from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,8 +22,8 @@ from ba_torchrl.commands import benchmark as benchmark_command
 from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.report import write_report
-from ba_torchrl.record.results import NON_LEARNING_FIELDS, RunResult, differences
-from ba_torchrl.record.summary import Axis, load_sections
+from ba_torchrl.record.results import NON_LEARNING_FIELDS, RESULT_FILE, RunResult, differences
+from ba_torchrl.record.summary import Axis, Run, load_runs, sections
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import expand, split
@@ -40,13 +43,31 @@ class Settings(StrictModel):
 def main(settings: Settings) -> None:
     """Write the report and print its tables."""
     folder = Path(settings.folder or Path(settings.runs[0]) / "report")
-    runs = load_sections(settings.runs, changes, completed)
+    runs, unfinished = load_runs(settings.runs)
+    if not runs:
+        where = ", ".join(settings.runs)
+        raise ConfigError(f"no finished run below {where}: a run leaves {RESULT_FILE} when it ends")
+    found = sections(completed(runs), changes)
     check_writable_folder(folder)
-    page = write_report(*runs, folder, settings.axis)
+    page = write_report(found, unfinished, folder, settings.axis)
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
-    tables = "table.md, table.tex, comparisons.csv; by seed seeds.csv, curves.csv"
+    tables = "table.md, comparisons.csv; by seed seeds.csv, curves.csv"
     print(f"  tables  {folder / 'table.csv'}, {tables}")
+
+
+def completed(runs: Iterable[Run]) -> list[Run]:
+    """Return runs with the defaults of settings that are newer than they are.
+
+    A run whose settings this version does not know is returned as it is.
+    """
+    found = []
+    for run in runs:
+        with contextlib.suppress(ConfigError):
+            config = ExperimentConfig.parse({**run.result.config, "device": "cpu"}).resolved()
+            run = replace(run, result=run.result.model_copy(update={"config": config}))
+        found.append(run)
+    return found
 
 
 def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
@@ -56,20 +77,7 @@ def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
     planned = _planned(run.benchmark).get((run.task, run.label))
     if planned is None:
         return {"tasks, algorithms and networks": (f"{run.task} with {run.label}", "those listed")}
-    found, ignored = completed(run).config, {*NON_LEARNING_FIELDS, "seed"}
-    return differences(found, planned.resolved(), ignored)
-
-
-def completed(run: RunResult) -> RunResult:
-    """Return the result with the defaults of settings that are newer than the run.
-
-    That of a run whose settings this version does not know is returned as it is.
-    """
-    try:
-        config = ExperimentConfig.parse({**run.config, "device": "cpu"}).resolved()
-    except ConfigError:
-        return run
-    return run.model_copy(update={"config": config})
+    return differences(run.config, planned.resolved(), {*NON_LEARNING_FIELDS, "seed"})
 
 
 @functools.cache

@@ -1,7 +1,7 @@
 """Reports of runs, made from the ``result.json`` of finished runs.
 
-A folder with a page (HTML), curves (SVG, PDF), tables (CSV, Markdown, LaTeX), values and curves by
-seed (CSV), and the videos.
+A folder with a page (HTML), curves (SVG, PDF), tables (CSV, Markdown), values and curves by seed
+(CSV), and the videos.
 """
 
 from __future__ import annotations
@@ -49,6 +49,14 @@ class _Column(NamedTuple):
         return "–" if row[self.key] != row[self.key] else self.form.format(**row)
 
 
+class _Table(NamedTuple):
+    """A table of a section."""
+
+    title: str
+    columns: Sequence[_Column]
+    rows: Sequence[dict[str, Any]]
+
+
 def _texts(*names: str) -> list[_Column]:
     return [_Column(name, name, f"{{{name}}}") for name in names]
 
@@ -69,22 +77,19 @@ _COMPARISONS = (
     *_texts("task", "first", "second", "seeds"),
     _Column("difference", "difference", "{difference:+.3f}"),
     _Column(_INTERVAL, "low", "{low:+.3f} to {high:+.3f}"),
-    _Column("P(first is better)", "improvement", "{improvement:.2f}"),
-    _Column(_INTERVAL, "improvement_low", "{improvement_low:.2f} to {improvement_high:.2f}"),
     _Column("", "reading", "{reading}"),
 )
 _SETTINGS = _texts("setting", "value", "methods")
 _FORMATS = (".svg", ".pdf")
-_LATEX = str.maketrans({**{c: f"\\{c}" for c in "&%$#_{}"}, "\\": r"\textbackslash ", "–": "--"})
 _DEFINITIONS = (
     "Success: mean over seeds of the success rates of the last policies in their test episodes, of "
     "the greedy policy; for all tasks the mean over tasks. Best: of the checkpoints with the best "
-    f"evaluation. Intervals and shading, {CONFIDENCE:.0%}: hierarchical bootstrap over seeds and "
-    "test scenes, stratified by task, never narrower than Wilson's of one run; that of a single "
-    "run does not contain the spread over seeds. Area: mean success of the evaluations during "
-    "training over environment steps, to the last step of all methods on the task. To "
+    f"evaluation. Intervals and shading, {CONFIDENCE:.0%}: Student's t over seeds and the normal "
+    "distribution over test scenes, never narrower than Wilson's of one run; that of a single run "
+    "does not contain the spread over seeds. Area: mean success of the evaluations during training "
+    "over environment steps, to the last step of all methods on the task. To "
     f"{GOOD_RATE:.0%}: when the mean curve first reaches that rate. Differences are paired by seed "
-    "and test scene; P is the probability that a run of the first method has the higher success."
+    "and test scene."
 )
 
 
@@ -97,7 +102,7 @@ def write_report(
     """Write the report of runs, and return the path of the page.
 
     Args:
-        sections: the finished runs; see `ba_torchrl.record.summary.load_sections`.
+        sections: the finished runs; see `ba_torchrl.record.summary.sections`.
         unfinished: folders of other runs, which are listed.
         folder: of the report; videos are copied into it.
         axis: of the curves.
@@ -110,18 +115,21 @@ def write_report(
     ]
     parts = [_part(section, folder, axis) for section in sections]
     runs = [
-        (_of_run(section, group, run), run)
+        ({"benchmark": section.title, "task": group.task, "method": group.method}, run)
         for section in sections
         for group in section.groups
         for run in group.runs
     ]
-    tables = {
-        "table": [row for part in parts for row in part["table"]],
-        "comparisons": [row for part in parts for row in part["comparisons"]],
+    for name, rows in {
+        "table": [row for part in parts for row in part["tables"][0].rows],
+        "comparisons": [row for part in parts for row in part["tables"][1].rows],
         "seeds": [{**names, **_final(run)} for names, run in runs],
-        "curves": [{**names, **p.model_dump()} for names, run in runs for p in run.result.curve],
-    }
-    for name, rows in tables.items():
+        "curves": [
+            {**names, "seed": run.result.seed, **point.model_dump()}
+            for names, run in runs
+            for point in run.result.curve
+        ],
+    }.items():
         path = folder / f"{name}.csv"
         with replaced(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
@@ -131,14 +139,10 @@ def write_report(
     if left_out:
         texts.append("\n".join(["## Not finished", "", *(f"- {run}" for run in left_out)]))
     write_text(folder / "table.md", "\n\n".join(texts) + "\n")
-    write_text(folder / "table.tex", "\n\n".join(map(_latex, parts)) + "\n")
     template = files("ba_torchrl.record").joinpath("report.html").read_text(encoding="utf-8")
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
     text = page.render(
         sections=parts,
-        columns=_TABLE,
-        comparison_columns=_COMPARISONS,
-        setting_columns=_SETTINGS,
         definitions=_DEFINITIONS,
         unfinished=left_out,
         made=now(),
@@ -190,7 +194,7 @@ def plot_groups(
 
 def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
     """Draw the figures of a section; return what the texts have of it."""
-    name, table, comparisons = _file_name(section.title), summarize(section), compare(section)
+    name = _file_name(section.title)
     plot_groups(section.groups, [folder / f"{name}{end}" for end in _FORMATS], axis)
     panels = {task: f"{name}/{_file_name(task)}" for task in section.tasks}
     for task, stem in panels.items():
@@ -199,26 +203,16 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
     return {
         "title": section.title,
         "name": name,
-        "note": _note(section),
         "warnings": list(_warnings(section)),
         "panels": panels,
-        "table": table,
-        "comparisons": comparisons,
-        "settings": differing_settings(section),
+        "tables": [
+            _Table("Success", _TABLE, summarize(section)),
+            _Table("Comparisons", _COMPARISONS, compare(section)),
+            _Table("Settings in which methods differ", _SETTINGS, differing_settings(section)),
+        ],
         "videos": _videos(section, folder),
         "machines": sorted({_machine(run) for group in section.groups for run in group.runs}),
     }
-
-
-def _note(section: Section) -> str:
-    """Return which policies the numbers are of, and where the curves start."""
-    text = "The table has the last policy of each run, on episodes that did not select it."
-    starts = (int(update) for group in section.groups for update in group.axis("updates")[:1])
-    first = sorted({*starts} - {0})
-    if first:
-        after = " to ".join(str(updates) for updates in dict.fromkeys((first[0], first[-1])))
-        text += f" Curves start at the first evaluation, after {after} updates."
-    return text
 
 
 def _warnings(section: Section) -> Iterator[str]:
@@ -231,21 +225,13 @@ def _warnings(section: Section) -> Iterator[str]:
     if few := [f"{group.task}, {group.method}" for group in rows]:
         least = f"fewer than {CITABLE_EPISODES} episodes"
         yield f"Tests with {least}, not to be cited: {'; '.join(few)}."
-    if section.not_pooled:
-        rows = "; ".join(section.not_pooled)
-        yield f"Not pooled, as they differ in {' or '.join(POOLED)}: {rows}."
-
-
-def _of_run(section: Section, group: Group, run: Run) -> dict[str, Any]:
-    """Return the columns that name a run."""
-    names = {"benchmark": section.title, "task": group.task, "method": group.method}
-    return {**names, "seed": run.result.seed}
 
 
 def _final(run: Run) -> dict[str, Any]:
-    """Return the columns of a run's final evaluation, and where it ran."""
+    """Return the columns of a run's seed, its tests, and where it ran."""
     result, last = run.result, run.result.last
     return {
+        "seed": result.seed,
         **{name: getattr(last, name) for name in ("updates", "episodes", "success_rate")},
         "mean_length": last.mean_length,
         "best_success_rate": result.best.success_rate,
@@ -258,33 +244,13 @@ def _final(run: Run) -> dict[str, Any]:
 
 
 def _markdown(part: dict[str, Any]) -> str:
-    lines = [f"## {part['title']}", "", part["note"]]
-    lines += [line for text in part["warnings"] for line in ("", f"**{text}**")]
-    for title, columns, rows in (
-        ("", _TABLE, part["table"]),
-        ("Comparisons:", _COMPARISONS, part["comparisons"]),
-        ("Settings in which methods differ:", _SETTINGS, part["settings"]),
-    ):
-        if rows:
-            lines += [*(["", title] if title else []), "", *pipes(*_cells(columns, rows))]
-    return "\n".join([*lines, "", *(f"- {machine}" for machine in part["machines"])])
-
-
-def _latex(part: dict[str, Any]) -> str:
-    """Return the table in LaTeX, for the package booktabs."""
-    texts = ([text.translate(_LATEX) for text in row] for row in _cells(_TABLE, part["table"]))
-    head, *rows = (" & ".join(row) + r" \\" for row in texts)
-    begin = rf"\begin{{tabular}}{{ll{'r' * (len(_TABLE) - 2)}}}"
-    notes = [f"% {text}" for text in (part["title"], _DEFINITIONS, part["note"], *part["warnings"])]
-    body = [r"\toprule", head, r"\midrule", *rows, r"\bottomrule", r"\end{tabular}"]
-    return "\n".join([*notes, begin, *body])
-
-
-def _cells(columns: Sequence[_Column], rows: Iterable[dict[str, Any]]) -> Iterator[list[str]]:
-    """Yield the headings and the rows of a table, as texts."""
-    yield [column.heading for column in columns]
-    for row in rows:
-        yield [column.cell(row) for column in columns]
+    paragraphs = [f"## {part['title']}", *(f"**{text}**" for text in part["warnings"])]
+    for table in part["tables"]:
+        if table.rows:
+            cells = ([column.cell(row) for column in table.columns] for row in table.rows)
+            headings = [column.heading for column in table.columns]
+            paragraphs += [f"{table.title}:", "\n".join(pipes(headings, *cells))]
+    return "\n\n".join([*paragraphs, "\n".join(f"- {machine}" for machine in part["machines"])])
 
 
 def _machine(run: Run) -> str:

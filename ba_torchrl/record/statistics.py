@@ -1,9 +1,9 @@
 """Statistics of success over runs and test episodes.
 
 Tests of a protocol play the same scenes in every run: runs and scenes are crossed, and the
-difficulty of the scenes does not average out over runs. Intervals are percentiles of a
-hierarchical bootstrap that resamples the runs of each task, then the scenes (Davison & Hinkley,
-1997, section 3.8; Owen, 2007). Episodes of one scene are resampled together.
+difficulty of the scenes does not average out over runs. Intervals are normal, with the variance of
+runs and that of scenes (Owen, 2007), the former with the quantile of Student's t. Episodes of one
+scene are one cluster.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.integrate import trapezoid
+from scipy.stats import norm, t
 
 from ba_torchrl.record.results import TestedPolicy
 
 CONFIDENCE = 0.95
-RESAMPLES = 2000
-Z = 1.959963984540054
-"""Quantile of the normal distribution for `CONFIDENCE`."""
+UPPER = (1 + CONFIDENCE) / 2
+Z = float(norm.ppf(UPPER))
 
 
 class Estimate(NamedTuple):
@@ -39,9 +39,7 @@ def wilson(rate: float | np.ndarray, episodes: float | np.ndarray) -> Estimate:
     return Estimate(rate, low, np.where(rate >= 1, 1.0, (centre + half) / scale))
 
 
-def mean_success(
-    tasks: Sequence[Sequence[TestedPolicy]], generator: np.random.Generator
-) -> Estimate:
+def mean_success(tasks: Sequence[Sequence[TestedPolicy]]) -> Estimate:
     """Return the mean success over runs, and over tasks with equal weights, with its interval.
 
     The interval is never narrower than Wilson's for one run at the mean rate: all runs are tested
@@ -60,12 +58,12 @@ def mean_success(
     low = value - np.linalg.norm(means - floor.low) / means.size
     high = value + np.linalg.norm(floor.high - means) / means.size
     if any(rates.size > 1 for rates, *_ in parts):
-        ends = _interval(value, [(rates, by_run.mean(0)) for rates, by_run, _ in parts], generator)
-        low, high = min(low, ends[0]), max(high, ends[1])
+        half = _half_width([(rates, by_run.mean(0)) for rates, by_run, _ in parts])
+        low, high = min(low, value - half), max(high, value + half)
     return Estimate(float(value), float(max(low, 0.0)), float(min(high, 1.0)))
 
 
-def mean_curve(rates: np.ndarray, episodes: np.ndarray, generator: np.random.Generator) -> Estimate:
+def mean_curve(rates: np.ndarray, episodes: np.ndarray) -> Estimate:
     """Return the mean of evaluations during training with its interval, [points].
 
     As `mean_success`, but over runs alone: evaluations have no outcomes by episode.
@@ -77,14 +75,13 @@ def mean_curve(rates: np.ndarray, episodes: np.ndarray, generator: np.random.Gen
     value = rates.mean(0)
     low, high = wilson(value, episodes.mean(0))[1:]
     if len(rates) > 1:
-        ends = _interval(value, [(rates, np.zeros(1))], generator)
-        low, high = np.minimum(low, ends[0]), np.maximum(high, ends[1])
+        half = _half_width([(rates, np.zeros(1))])
+        low, high = np.minimum(low, value - half), np.maximum(high, value + half)
     return Estimate(value, np.maximum(low, 0.0), np.minimum(high, 1.0))
 
 
 def paired_difference(
     tasks: Sequence[tuple[Sequence[TestedPolicy], Sequence[TestedPolicy]]],
-    generator: np.random.Generator,
 ) -> Estimate:
     """Return the mean difference of success, first minus second, with its interval.
 
@@ -104,34 +101,8 @@ def paired_difference(
         parts.append((rates[:middle] - rates[middle:], influence))
         square += (influence**2).sum() + (episodes > 0).sum(1).mean() ** -2.0
     value = np.mean([difference.mean() for difference, _ in parts])
-    half = Z * np.sqrt(square) / len(parts)
-    ends = _interval(value, parts, generator)
-    low, high = min(value - half, ends[0]), max(value + half, ends[1])
-    return Estimate(float(value), float(max(low, -1.0)), float(min(high, 1.0)))
-
-
-def probability_of_improvement(
-    tasks: Sequence[tuple[np.ndarray, np.ndarray]], generator: np.random.Generator
-) -> Estimate:
-    """Return the probability that a run of the first method has the higher success on its task.
-
-    It is the mean over tasks of the share of pairs of runs, ties as one half (Agarwal et al.,
-    2021), with the interval of a bootstrap over runs, stratified by task. The interval is never
-    narrower than Wilson's of as many pairs as the method with fewer runs has runs, whose variance
-    is the largest that the share can have (Birnbaum & Klose, 1957).
-
-    Args:
-        tasks: of each task the success rates of both methods' runs, [runs] each.
-    """
-    value, pairs, drawn = 0.0, 0, np.zeros(RESAMPLES)
-    for first, second in tasks:
-        wins = (np.sign(np.subtract.outer(first, second)) + 1) / 2
-        rows, columns = (generator.integers(n, size=(RESAMPLES, n)) for n in wins.shape)
-        value += wins.mean() / len(tasks)
-        pairs += min(wins.shape)
-        drawn += wins[rows[:, :, None], columns[:, None, :]].mean((1, 2)) / len(tasks)
-    (low, high), floor = _quantiles(drawn), wilson(value, pairs)
-    return Estimate(float(value), float(min(low, floor.low)), float(max(high, floor.high)))
+    half = max(Z * np.sqrt(square) / len(parts), _half_width(parts))
+    return Estimate(float(value), float(max(value - half, -1)), float(min(value + half, 1)))
 
 
 def area_under_success(steps: Sequence[int], rates: Sequence[float], end: int) -> float:
@@ -147,8 +118,8 @@ def area_under_success(steps: Sequence[int], rates: Sequence[float], end: int) -
     """
     if not len(steps) or end <= steps[0]:
         return float("nan")
-    steps, rates = np.append(steps, end), np.append(rates, rates[-1])
-    return float(np.diff(steps) @ (rates[1:] + rates[:-1]) / 2 / (end - steps[0]))
+    area = trapezoid([*rates, rates[-1]], [*steps, end])
+    return float(area / (end - steps[0]))
 
 
 def _by_scene(tests: Sequence[TestedPolicy]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -181,43 +152,20 @@ def _effective_episodes(rates: np.ndarray, by_run: np.ndarray, episodes: np.ndar
     return float(np.clip(number, scenes, episodes.sum(1).mean()))
 
 
-def _interval(
-    value: np.ndarray | float,
-    tasks: Sequence[tuple[np.ndarray, np.ndarray]],
-    generator: np.random.Generator,
-) -> np.ndarray:
-    """Return the interval of a mean over tasks of means over runs, [2, ...].
+def _half_width(tasks: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+    """Return half of the interval of a mean over tasks of means over runs, [...].
 
-    Resamples of n runs spread less than n runs do. Deviations over runs are widened by
-    sqrt(n / (n - 1)) and by the ratio of the quantiles of Student's t and the normal distribution,
-    with Satterthwaite's degrees of freedom over tasks.
+    The variance of the runs has Satterthwaite's degrees of freedom over tasks.
 
     Args:
-        value: the mean, [...].
         tasks: of each task the values of its runs, [runs, ...], and the influences of its scenes
             on their mean, [scenes].
     """
-    drawn = np.zeros((RESAMPLES, *np.shape(value)))
+    of_scenes = Z**2 * sum((influence**2).sum() for _, influence in tasks)
     several = [runs for runs, _ in tasks if len(runs) > 1]
-    for _, influence in tasks:
-        scenes = generator.integers(len(influence), size=(RESAMPLES, len(influence)))
-        of_scenes = influence[scenes].sum(1)
-        drawn += of_scenes.reshape(-1, *np.ones(np.ndim(value), int))
-    if several:
-        squares = [runs.var(0, ddof=1) / len(runs) for runs in several]
-        rest = sum(
-            square**2 / (len(runs) - 1) for square, runs in zip(squares, several, strict=True)
-        )
-        most = sum(len(runs) - 1 for runs in several)
-        with np.errstate(invalid="ignore"):
-            freedom = np.where(rest > 0, sum(squares) ** 2 / rest, most)
-        widening = stdtrit(freedom, (1 + CONFIDENCE) / 2) / Z
-        for runs in several:
-            n = len(runs)
-            means = runs[generator.integers(n, size=(RESAMPLES, n))].mean(1)
-            drawn += widening * np.sqrt(n / (n - 1)) * (means - runs.mean(0))
-    return value + _quantiles(drawn / len(tasks))
-
-
-def _quantiles(drawn: np.ndarray) -> np.ndarray:
-    return np.quantile(drawn, [(1 - CONFIDENCE) / 2, (1 + CONFIDENCE) / 2], axis=0)
+    of_runs = [runs.var(0, ddof=1) / len(runs) for runs in several]
+    shares = [square**2 / (len(runs) - 1) for square, runs in zip(of_runs, several, strict=True)]
+    with np.errstate(invalid="ignore"):
+        freedom = np.divide(np.square(sum(of_runs)), sum(shares))
+    quantile = np.nan_to_num(t.ppf(UPPER, freedom))  # runs without a difference: 0
+    return np.sqrt(of_scenes + quantile**2 * sum(of_runs)) / len(tasks)

@@ -34,7 +34,6 @@ from ba_torchrl.record.statistics import (
     mean_curve,
     mean_success,
     paired_difference,
-    probability_of_improvement,
 )
 
 logger = logging.getLogger(__name__)
@@ -43,8 +42,6 @@ Axis = Literal["env_steps", "updates"]
 Changes = Callable[[RunResult], Mapping[str, tuple[Any, Any]]]
 """From a run to the settings in which it differs from its benchmark: its value and the benchmark's,
 by name."""
-Completed = Callable[[RunResult], RunResult]
-"""Fills in the defaults of settings that are newer than the run."""
 
 POOLED: Mapping[str, Callable[[RunResult], object]] = {
     "task version": lambda run: run.task_version,
@@ -78,15 +75,16 @@ class Run:
         """Wall time, nan of a policy from a file."""
         return math.nan if self.result.seconds is None else self.result.seconds / 3600
 
-    def differences(self, other: Run) -> dict[str, tuple[Any, Any]]:
-        """Return the settings in which the runs differ besides their seed, with both values."""
-        ignored = {*NON_LEARNING_FIELDS, "seed"}
-        return differences(self.settings, other.settings, ignored)
-
-    @property
+    @cached_property
     def settings(self) -> dict[str, Any]:
-        """Its configuration, and what `POOLED` names."""
-        return {**self.result.config, **{name: of(self.result) for name, of in POOLED.items()}}
+        """By dotted name, what affects learning in its configuration, and what `POOLED` names."""
+        ignored = {*NON_LEARNING_FIELDS, "seed"}
+        config = {name: each for name, each in self.result.config.items() if name not in ignored}
+        return flat({**config, **{name: of(self.result) for name, of in POOLED.items()}})
+
+    def differences(self, other: Run) -> dict[str, tuple[Any, Any]]:
+        """Return the settings in which the runs differ, with both values."""
+        return differences(self.settings, other.settings)
 
 
 @dataclass(frozen=True)
@@ -124,12 +122,12 @@ class Group:
             np.array([[getattr(point, name) for point in curve] for curve in self.curves])
             for name in ("success_rate", "episodes")
         )
-        return mean_curve(rates, episodes, np.random.default_rng(0))
+        return mean_curve(rates, episodes)
 
     @cached_property
     def success(self) -> Estimate:
         """Mean success of the tests of the last policies."""
-        return mean_success([self.tests], np.random.default_rng(0))
+        return mean_success([self.tests])
 
     @property
     def tests(self) -> list[TestedPolicy]:
@@ -194,23 +192,8 @@ class Section:
         of_methods = ([g for g in self.groups if g.method == name] for name in self.methods)
         return [groups for groups in of_methods if len(groups) == len(self.tasks)]
 
-    @property
-    def not_pooled(self) -> list[str]:
-        """Rows of a task and a label that differ in what `POOLED` names, and their folders."""
-        found = []
-        for group in self.groups:
-            first = group.runs[0]
-            others = [each.runs[0] for each in self.of_task(group.task)]
-            others = [other for other in others if other.result.label == first.result.label]
-            if any(POOLED.keys() & first.differences(other).keys() for other in others):
-                folders = ", ".join(str(run.folder) for run in group.runs)
-                found.append(f"{group.task}, {group.method}: {folders}")
-        return found
 
-
-def load_runs(
-    roots: Iterable[str | Path], completed: Completed = lambda run: run
-) -> tuple[list[Run], list[Path]]:
+def load_runs(roots: Iterable[str | Path]) -> tuple[list[Run], list[Path]]:
     """Read every finished run below some folders, and the folders of unfinished runs.
 
     Folders with a damaged result are unfinished. Copies of a run are left out.
@@ -219,7 +202,7 @@ def load_runs(
     runs: list[Run] = []
     for folder in finished:
         try:
-            run = Run(folder, completed(read_result(folder)))
+            run = Run(folder, read_result(folder))
         except ValueError as error:
             logger.warning("left out: %s", error)
             unfinished.append(folder)
@@ -231,26 +214,15 @@ def load_runs(
     return runs, unfinished
 
 
-def load_sections(
-    roots: Sequence[str | Path],
-    changes: Changes = lambda _: {},
-    completed: Completed = lambda run: run,
-) -> tuple[list[Section], list[Path]]:
-    """Read every finished run below some folders.
+def sections(runs: Iterable[Run], changes: Changes = lambda _: {}) -> list[Section]:
+    """Return runs in sections in the order of the benchmarks' names, those without one last.
 
-    Return sections in the order of the benchmarks' names, runs without a benchmark last; and the
-    folders of unfinished runs. Runs whose settings are not those of their benchmark have a section
-    of their own, "NAME, changed".
+    Runs whose settings are not those of their benchmark have a section of their own, "NAME,
+    changed".
 
     Raises:
-        ConfigError: there is no finished run, or runs have the same settings and seed.
+        ConfigError: runs have the same settings and seed.
     """
-    runs, unfinished = load_runs(roots, completed)
-    if not runs:
-        raise ConfigError(
-            f"no finished run below {', '.join(map(str, roots))}: "
-            "a run leaves its result.json when it ends"
-        )
     by_title: dict[str, tuple[list[Run], set[str]]] = {}
     for run in runs:
         found = changes(run.result).items()
@@ -261,7 +233,7 @@ def load_sections(
     return [
         Section(title, grouped(by_title[title][0]), sorted(by_title[title][1]))
         for title in sorted(by_title, key=lambda title: (title == OTHER_RUNS, title))
-    ], unfinished
+    ]
 
 
 def grouped(runs: Iterable[Run]) -> list[Group]:
@@ -269,16 +241,12 @@ def grouped(runs: Iterable[Run]) -> list[Group]:
 
     Methods with several settings get distinct names.
     """
-    alike: list[list[Run]] = []
+    by_settings: dict[tuple[str, ...], list[Run]] = {}
     for run in runs:
-        names = run.result.task, run.result.label
-        for members in alike:
-            first = members[0]
-            if (first.result.task, first.result.label) == names and not first.differences(run):
-                members.append(run)
-                break
-        else:
-            alike.append([run])
+        settings = {name: value for name, value in run.settings.items() if value is not None}
+        key = run.result.task, run.result.label, repr(sorted(settings.items()))
+        by_settings.setdefault(key, []).append(run)
+    alike = [*by_settings.values()]
     groups, twice = [], []
     for members in alike:
         result, seeds = members[0].result, [run.result.seed for run in members]
@@ -304,8 +272,7 @@ def _distinction(run: Run, others: Sequence[Run]) -> str:
             differing = run.differences(other).keys()
             is_same_task = other.result.task == run.result.task
             names |= differing if is_same_task else differing & {*_OF_METHODS}
-    settings = flat(run.settings)
-    values = [f"{name} {settings.get(name)}" for name in sorted(names)]
+    values = [f"{name} {run.settings.get(name)}" for name in sorted(names)]
     return f" ({', '.join(values)})" if values else ""
 
 
@@ -317,7 +284,7 @@ def differing_settings(section: Section) -> list[dict[str, str]]:
         names |= {name for other in others for name in first.differences(other)}
     found: dict[tuple[str, str], set[str]] = {}
     for group in section.groups:
-        settings = flat(group.runs[0].settings)
+        settings = group.runs[0].settings
         for name in names:
             found.setdefault((name, str(settings.get(name, "–"))), set()).add(group.method)
     return [
@@ -335,17 +302,14 @@ def summarize(section: Section) -> list[dict[str, Any]]:
     rows = [_row(section, group) for group in section.groups]
     for groups in section.on_all_tasks() if len(section.tasks) > 1 else ():
         own = [row for row in rows if row["method"] == groups[0].method]
-        success = mean_success([group.tests for group in groups], np.random.default_rng(0))
         together = {
-            **dict.fromkeys(rows[0], math.nan),
-            "benchmark": section.title,
             "task": ALL_TASKS,
-            "method": groups[0].method,
             **{name: min(row[name] for row in own) for name in ("seeds", "episodes")},
-            **_columns("success", success),
+            **_columns("success", mean_success([group.tests for group in groups])),
             **{name: _mean(row[name] for row in own) for name in ("best", "area", "hours")},
+            **dict.fromkeys(("updates_to_80", "env_steps_to_80", "mean_length"), math.nan),
         }
-        rows.append(together)
+        rows.append({**own[0], **together})
     return rows
 
 
@@ -388,19 +352,16 @@ def compare(section: Section) -> list[dict[str, Any]]:
 
 def _comparison(title: str, task: str, pairs: Sequence[tuple[Group, Group]]) -> dict[str, Any]:
     """Return the row of two methods on one task, or on all tasks."""
-    difference = improvement = Estimate(math.nan, math.nan, math.nan)
-    least = 0
+    difference, least = Estimate(math.nan, math.nan, math.nan), 0
     if obstacles := sorted({name for pair in pairs for name in _obstacles(*pair)}):
         reading = f"not compared: {', '.join(obstacles)}"
     else:
-        tests, rates = [], []
+        tests = []
         for pair in pairs:
             seeds = sorted(pair[0].by_seed.keys() & pair[1].by_seed.keys())
             tests.append([[group.by_seed[seed] for seed in seeds] for group in pair])
-            rates.append([[test.success_rate for test in group.tests] for group in pair])
         least = min(len(first) for first, _ in tests)
-        difference = paired_difference(tests, np.random.default_rng(0))
-        improvement = probability_of_improvement(rates, np.random.default_rng(0))
+        difference = paired_difference(tests)
         reading = DIRECTION if least < ENOUGH_SEEDS else ""
     return {
         "benchmark": title,
@@ -409,7 +370,6 @@ def _comparison(title: str, task: str, pairs: Sequence[tuple[Group, Group]]) -> 
         "second": pairs[0][1].method,
         "seeds": least,
         **_columns("difference", difference),
-        **_columns("improvement", improvement, "improvement_"),
         "reading": reading,
     }
 
@@ -430,8 +390,8 @@ def pipes(header: Sequence[str], *rows: Sequence[str]) -> list[str]:
     return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]
 
 
-def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:
-    return {name: found.value, f"{prefix}low": found.low, f"{prefix}high": found.high}
+def _columns(name: str, found: Estimate) -> dict[str, float]:
+    return {name: found.value, "low": found.low, "high": found.high}
 
 
 def _mean(values: Iterable[float]) -> float:

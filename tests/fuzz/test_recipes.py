@@ -23,7 +23,7 @@ WORK = {
     "train": "ba_torchrl.training.experiment.Experiment",
     "benchmark": "plan",
     "report": None,  # there is no finished run
-    "leaderboard": "package_runs",
+    "leaderboard": "read_records",
     "plot": "read_config",
     "gallery": "expert_strip",
     "tasks": "page",

@@ -46,19 +46,17 @@ def records(tmp_path, monkeypatch):
 def test_every_task_has_a_row_and_empty_cells_are_visible(tmp_path):
     runs = [make_run(tmp_path / "a"), make_run(tmp_path / "b", task=PICK, label="bc cnn")]
     header, *rows = leaderboard(runs, [], list_tasks(), protocol=1).rows()
-    assert header == ["task", "bc cnn", "sacfd equi"]
+    assert header == ("task", "method", "success")
     assert [row[0] for row in rows] == list_tasks()
-    cells = {task: (first, second) for task, first, second in rows}
-    assert cells[REACH] == ("–", "0.90 (0.85 to 0.93) 1×200*")
-    assert cells[PICK] == ("0.90 (0.85 to 0.93) 1×200*", "–")
-    assert {cell for task, pair in cells.items() if task not in (REACH, PICK) for cell in pair} == {
-        "–"
-    }
+    cells = {task: cells for task, *cells in rows}
+    assert cells.pop(REACH) == ["sacfd equi", "0.90 (0.85 to 0.93) 1×200*"]
+    assert cells.pop(PICK) == ["bc cnn", "0.90 (0.85 to 0.93) 1×200*"]
+    assert all(row == ["–", "–"] for row in cells.values())
 
 
 def test_five_seeds_are_no_mere_direction(tmp_path):
     runs = [make_run(tmp_path / str(seed), seed=seed) for seed in range(5)]
-    (_, (_, cell)) = leaderboard(runs, [], [REACH], protocol=1).rows()
+    (_, (_, _, cell)) = leaderboard(runs, [], [REACH], protocol=1).rows()
     assert re.fullmatch(r"0\.90 \(0\.8\d to 0\.9\d\) 5×200", cell)
 
 
@@ -73,7 +71,7 @@ def test_all_runs_of_other_versions_are_left_out_and_named(tmp_path):
     runs = [make_run(tmp_path / str(n), **each) for n, each in enumerate(others.values())]
     runs += [make_run(tmp_path / "none", expert_version=None)]
     board = leaderboard([], runs, [REACH], protocol=1)
-    assert [len(group.runs) for group in board.cells.values()] == [1]
+    assert [len(group.runs) for group in board.groups] == [1]
     for text, run, why in zip(board.left_out, runs, others, strict=False):
         assert text.endswith(f"seed 0 ({run.folder}): {why}")
     assert len(board.left_out) == len(others)
@@ -82,9 +80,9 @@ def test_all_runs_of_other_versions_are_left_out_and_named(tmp_path):
 def test_own_runs_are_beside_those_of_the_package(tmp_path):
     packaged, own = make_run(tmp_path / "a"), make_run(tmp_path / "b", 0.5)
     board = leaderboard([packaged], [packaged, own], [REACH], protocol=1)
-    assert board.methods == ["sacfd equi", "sacfd equi, own"]
-    assert board.rows()[1][2].startswith("0.50")
-    assert leaderboard([packaged], [packaged], [REACH], protocol=1).methods == ["sacfd equi"]
+    assert [group.method for group in board.groups] == ["sacfd equi", "sacfd equi, own"]
+    assert list(board.rows())[-1][-1].startswith("0.50")
+    assert len(leaderboard([packaged], [packaged], [REACH], protocol=1).groups) == 1
     with pytest.raises(ConfigError, match=r"same settings and seed: .*/a, .*/b"):
         leaderboard([], [packaged, own], [REACH], protocol=1)
 
@@ -97,18 +95,13 @@ def test_the_command_prints_the_table(tmp_path, capsys):
     (tmp_path / "runs/c/config.json").write_text("{}")
     command.COMMAND.run([str(tmp_path / "runs")])
     text = capsys.readouterr().out
-    assert re.search(rf"^{REACH}  +0\.90 \(", text, flags=re.MULTILINE)
-    assert re.search(rf"^{PICK}  +–$", text, flags=re.MULTILINE)
+    assert re.search(rf"^\| {REACH}  +\| my method \| 0\.90 \(", text, flags=re.MULTILINE)
+    assert re.search(rf"^\| {PICK}  +\| –  +\| –  +\|$", text, flags=re.MULTILINE)
     assert "older, seed 0" in text
     assert f"- {tmp_path / 'runs/c'}: interrupted" in text
-    command.COMMAND.run([str(tmp_path / "runs"), "format=markdown"])
-    assert f"| {PICK} | – |" in capsys.readouterr().out
     command.COMMAND.run([])  # no records
-    assert all(
-        f"\n{task}\n" in capsys_text
-        for capsys_text in [capsys.readouterr().out]
-        for task in list_tasks()
-    )
+    text = capsys.readouterr().out
+    assert all(f"\n| {task} " in text for task in list_tasks())
 
 
 def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
