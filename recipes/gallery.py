@@ -1,7 +1,7 @@
 """Draw the tasks: a picture and a film of each, and one picture of all.
 
 python recipes/gallery.py                       # in runs/gallery
-python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png films=true overwrite=true
+python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png films=true
 python recipes/gallery.py 'tasks=[close_loop/block_picking]' folder=pictures overview=null
 """
 
@@ -25,7 +25,6 @@ from ba_torchrl.cli.types import (
     PngFile,
     Seed,
     Tasks,
-    check_untracked,
     checked,
 )
 from ba_torchrl.core import keys
@@ -72,8 +71,6 @@ class Settings(PluginSettings):
     """Of pictures and films."""
     overview: PngFile | None = "runs/gallery/all_tasks.png"
     """Picture of all tasks, or null."""
-    overwrite: bool = False
-    """Also write over files that git tracks."""
 
 
 class Strip(NamedTuple):
@@ -96,9 +93,6 @@ def main(settings: Settings) -> None:
         task: folder / f"{task.replace('/', '_')}_deconstruction.png"
         for task in settings.deconstructions
     }
-    if not settings.overwrite:
-        overview = [settings.overview] if settings.overview else []
-        check_untracked([*files.values(), *films.values(), *apart.values(), *overview])
     for task, path in tqdm(files.items(), unit="task"):
         strip = strips[task] = expert_strip(task, settings.seed, pictures=2)
         still = Image.fromarray(strip.pictures[-1]).resize((STILL, STILL))

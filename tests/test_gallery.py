@@ -1,16 +1,12 @@
-import subprocess
-
 import imageio.v3 as imageio
 import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
 from ba_torchrl import make
-from ba_torchrl.commands import tasks
 from ba_torchrl.core import keys
 from ba_torchrl.record.video import FrameRecorder
 from recipes.gallery import (
-    COMMAND,
     MOST_FRAMES,
     Strip,
     expert_strip,
@@ -141,30 +137,3 @@ def test_every_open_loop_step_has_a_frame_of_the_contact_and_one_after_it():
         for a, b in zip(recorder.frames, recorder.frames[1:], strict=False)
     ]
     assert min(changes) > 0
-
-
-def test_files_that_git_tracks_are_overwritten_only_on_request(monkeypatch, tmp_path, capsys):
-    monkeypatch.chdir(tmp_path)
-    strip = Strip([np.zeros((8, 8, 3), np.uint8)] * 2, np.zeros((8, 8), np.float32))
-    played = []
-    monkeypatch.setattr("recipes.gallery.expert_strip", lambda *_, **__: played.append(1) or strip)
-    tracked = [tmp_path / name for name in ("close_loop_block_reaching.png", "[tasks].md")]
-    for path in tracked:
-        path.write_text("old")
-    subprocess.run(["git", "init", "-q"], check=True)
-    subprocess.run(["git", "add", "."], check=True)
-    draw = [f"tasks=[{TASK}]", "deconstructions=[]", "folder=.", "overview=all.png"]
-    page = [f"tasks=[{TASK}]", "path='[tasks].md'"]
-    lines = [(COMMAND, draw), (tasks.COMMAND, page)]
-    for (command, words), path in zip(lines, tracked, strict=True):
-        with pytest.raises(SystemExit):
-            command.run(words)
-        assert f"git tracks {path.name}" in capsys.readouterr().err
-        assert path.read_text() == "old"
-    assert not played
-    for (command, words), path in zip(lines, tracked, strict=True):
-        command.run([*words, "overwrite=true"])
-        assert path.read_bytes() != b"old"
-    for _ in range(2):  # git does not track it
-        COMMAND.run([*draw[:2], "folder=new", "overview=all.png"])
-    assert len(played) == 3

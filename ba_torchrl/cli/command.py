@@ -8,11 +8,10 @@ import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NoReturn
 
-import hydra
 from hydra import compose, initialize_config_dir
 from hydra.core.config_store import ConfigStore
 from hydra.core.hydra_config import HydraConfig
@@ -33,24 +32,20 @@ from ba_torchrl.record.results import flat
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 
-_OF_HYDRA = ("--multirun", "-m", "--cfg", "-c", "--info", "-i", "--package", "-p", "--resolve")
-"""Options of Hydra that a command with a configuration has too."""
 LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
 
 
-@dataclass
+@dataclass(frozen=True)
 class Arguments:
     """The parts of a command line."""
 
-    overrides: list[str] = field(default_factory=list)
+    overrides: Sequence[str] = ()
     """In Hydra's grammar, such as ``env.obs_size=64``."""
     config_name: str | None = None
     """Of another configuration than the command's own."""
     config_dir: str | None = None
     """A further folder of configurations."""
     asks_for_help: bool = False
-    is_for_hydra: bool = False
-    """Whether an option is one of Hydra's."""
 
     @property
     def names(self) -> set[str]:
@@ -61,9 +56,8 @@ class Arguments:
     def fields(self) -> set[str]:
         """The same, with the fields of one that is given in braces, such as ``algorithm.init.name``
         for ``algorithm.init={name: bc}``; Hydra has read the settings."""
-        parsed = OverridesParser.create().parse_overrides(self.overrides)
-        values = {each.key_or_group: each.value() for each in parsed}
-        return self.names | flat(values).keys()
+        parsed = OverridesParser.create().parse_overrides([*self.overrides])
+        return self.names | flat({each.key_or_group: each.value() for each in parsed}).keys()
 
 
 @dataclass(frozen=True)
@@ -93,8 +87,7 @@ class Command:
     @plain_errors
     def run(self, words: Sequence[str] | None = None) -> None:
         """Run the command; an error in its arguments is one line, and ends the process."""
-        words = sys.argv[1:] if words is None else words
-        arguments = self.read(words)
+        arguments = self.read(sys.argv[1:] if words is None else words)
         if self.config is None:
             load_plugins(hydra_schema.plugins_in(arguments.overrides))
         elif self._is_answered_early(arguments):
@@ -103,12 +96,16 @@ class Command:
             hydra_schema.register(arguments.overrides)
         with self.composed(arguments) as settings:  # an unknown name ends it here
             if arguments.asks_for_help:
-                print(self._help(OmegaConf.to_container(settings), True))  # noqa: T201
-            elif not arguments.is_for_hydra:
-                logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
-                self._run_composed(settings, arguments)
-        if arguments.is_for_hydra and not arguments.asks_for_help:
-            self._run_in_hydra(words)
+                print(self._help(settings, with_choices=True))  # noqa: T201
+                return
+            logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
+            limit_library_logs()
+            self._apply(lambda values: self.main(self._parsed(values, arguments)), settings)
+
+    def _parsed(self, values: dict[str, Any], arguments: Arguments) -> Any:
+        if self.parse is None:
+            return parse(self.settings, values, "settings")
+        return self.parse(values, arguments)
 
     def _is_answered_early(self, arguments: Arguments) -> bool:
         """Refuse what is wrong, or print the help, without the import of torch, which takes
@@ -122,16 +119,17 @@ class Command:
         groups = {name.split(".")[0] for name in arguments.names} & {*hydra_schema.GROUPS}
         with self.composed(arguments) as settings:
             if arguments.asks_for_help and not groups:
-                print(self._help(OmegaConf.to_container(settings), False))  # noqa: T201
+                print(self._help(settings, with_choices=False))  # noqa: T201
                 return True
-            if self.check is not None and not (arguments.asks_for_help or arguments.is_for_hydra):
+            if self.check is not None and not arguments.asks_for_help:
                 self._apply(self.check, settings)
         return False
 
-    def _help(self, values: dict[str, Any], with_choices: bool) -> str:
+    def _help(self, settings: DictConfig, with_choices: bool) -> str:
         words = "".join(f" [{name.upper()}]" for name in (self.positional or "").split())
         usage = f"{self.name}{words} [FIELD=VALUE ...]"
         text = sys.modules[self.main.__module__].__doc__ or ""
+        values = OmegaConf.to_container(settings)
         return describe(usage, text, self.settings, values, self.config_names(), with_choices)
 
     def config_names(self, further: str | None = None) -> list[str]:
@@ -155,19 +153,17 @@ class Command:
         except argparse.ArgumentError as error:
             raise ConfigError(str(error)) from None
         options = [word for word in rest if word.startswith("-")]
-        given = {option.split("=")[0] for option in options}
-        is_for_hydra = self.config is not None and bool(given & {*_OF_HYDRA})
-        if options and not is_for_hydra:
+        if options:
             self._refuse(options[0], words)
         if self.config is None and (found.config_name or found.config_dir):
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
         if found.config_dir is not None and not Path(found.config_dir).is_dir():
             raise ConfigError(f"there is no folder {found.config_dir}")
-        overrides = [word for word in rest if word[:1] != "-" and ("=" in word or word[:1] == "~")]
-        bare = [word for word in rest if word[:1] != "-" and word not in overrides]
-        if bare and not is_for_hydra:  # else they are values of its options
+        overrides = [word for word in rest if "=" in word or word.startswith("~")]
+        bare = [word for word in rest if word not in overrides]
+        if bare:
             overrides += self._positional(bare, overrides)
-        return Arguments(overrides, found.config_name, found.config_dir, found.help, is_for_hydra)
+        return Arguments(overrides, found.config_name, found.config_dir, found.help)
 
     def _refuse(self, option: str, words: Sequence[str]) -> NoReturn:
         """Refuse an option; if it is the name of a setting, say how to write it."""
@@ -177,7 +173,7 @@ class Command:
         if self.config is not None:
             groups = (folder.name for folder in config_dir().iterdir() if folder.is_dir())
             settings |= {*ExperimentConfig.model_fields, *groups}
-            known += ["--config-name", "--config-dir", *_OF_HYDRA]
+            known += ["--config-name", "--config-dir"]
         if name.split(".")[0] not in settings:
             raise UnknownNameError("option", option, known)
         if not value:
@@ -213,8 +209,6 @@ class Command:
             overrides.append(f"hydra.searchpath=['file://{other}']")
         with initialize_config_dir(str(main_folder), version_base="1.3", job_name=self.name):
             try:
-                if arguments.is_for_hydra:
-                    overrides = list(_first_of_sweeps(overrides))
                 settings = compose(name, overrides=overrides, return_hydra_config=True)
             except HydraException as error:
                 raise _explained(error) from None
@@ -238,17 +232,6 @@ class Command:
         ConfigStore.instance().store(name=f"_{self.name}", node=node)
         return f"_{self.name}"
 
-    def _run_composed(self, settings: DictConfig, arguments: Arguments) -> None:
-        def run(values: dict[str, Any]) -> None:
-            if self.parse is None:
-                found = parse(self.settings, values, "settings")
-            else:
-                found = self.parse(values, arguments)
-            self.main(found)
-
-        limit_library_logs()
-        self._apply(run, settings)
-
     @staticmethod
     def _apply(function: Callable[[dict[str, Any]], object], settings: DictConfig) -> None:
         """Call a function with the values of the settings; its errors name presets."""
@@ -260,25 +243,6 @@ class Command:
         except ConfigError as error:
             name_presets(error, settings)
             raise
-
-    def _run_in_hydra(self, words: Sequence[str]) -> None:
-        """Run with an option of Hydra, such as ``--multirun`` or ``--cfg job``."""
-
-        @plain_errors
-        def job(settings: DictConfig) -> None:
-            self._run_composed(settings, Arguments([*HydraConfig.get().overrides.task]))
-
-        sys.argv[1:] = words
-        folder = str(config_dir())
-        hydra.main(config_path=folder, config_name=self.config, version_base="1.3")(job)()
-
-
-def _first_of_sweeps(overrides: Sequence[str]) -> Iterator[str]:
-    """Yield overrides; of those with several values, as for ``--multirun``, the first one."""
-    for override in OverridesParser.create().parse_overrides(list(overrides)):
-        is_sweep = override.is_sweep_override()
-        first = next(override.sweep_string_iterator()) if is_sweep else ""
-        yield f"{override.get_key_element()}={first}" if is_sweep else override.input_line
 
 
 def _explained(error: HydraException) -> ConfigError:

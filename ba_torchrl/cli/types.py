@@ -5,11 +5,11 @@ from __future__ import annotations
 import errno
 import functools
 import os
-import subprocess
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from pathlib import Path
-from typing import Annotated, Any, ClassVar
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
@@ -17,6 +17,11 @@ from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
+
+if TYPE_CHECKING:
+    from torchrl.envs import EnvBase
+
+    from ba_torchrl.envs.settings import ResolvedEnv
 
 MAX_NAME_BYTES = 230
 """Longest name of a file that a command writes. File systems allow 255 bytes, of which temporary
@@ -31,14 +36,6 @@ def checked(check: Callable[[Any], Any]) -> AfterValidator:
         return value
 
     return AfterValidator(validate)
-
-
-def without(values: dict[str, Any], **reserved: str) -> dict[str, Any]:
-    """Return fields of `EnvConfig`, none of which the command sets itself."""
-    for name, instead in reserved.items():
-        if name in values:
-            raise ConfigError(f"{name} is set by the command; leave it out, and {instead}")
-    return values
 
 
 def check_new(path: str | Path) -> None:
@@ -59,11 +56,10 @@ def check_writable_folder(folder: str | Path) -> None:
         with tempfile.TemporaryFile(dir=folder):
             pass
     except FileExistsError:
-        raise ConfigError(f"cannot write to {_short(folder)}: it is not a folder") from None
-    except OSError as error:
-        raise ConfigError(f"cannot write to {_short(folder)}: {error.strerror}") from None
-    except ValueError as error:
-        raise ConfigError(f"cannot write to {folder!r}: {error}") from None
+        raise ConfigError(f"cannot write to {folder}: it is not a folder") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", error)
+        raise ConfigError(f"cannot write to {folder}: {reason}") from None
 
 
 def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
@@ -72,24 +68,12 @@ def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     if suffixes and path.suffix.lower() not in suffixes:
         raise ConfigError(f"the name of the file ends in {' or '.join(suffixes)}, not {path.name}")
     if len(os.fsencode(path.name)) > MAX_NAME_BYTES:
-        raise ConfigError(f"cannot write to {_short(path)}: the name is too long")
+        raise ConfigError(f"cannot write to {path}: the name is too long")
     check_writable_folder(path.parent)
     if os.path.isdir(path):
         raise ConfigError(f"cannot write to {path}: it is a folder; name a file")
     if os.path.exists(path) and not os.access(path, os.W_OK):
         raise ConfigError(f"cannot write to {path}: {os.strerror(errno.EACCES)}")
-
-
-def check_untracked(paths: Iterable[str | Path]) -> None:
-    """Check that git tracks none of the files, so that a command can write over them."""
-    for path in map(Path, paths):
-        command = ["git", "-C", str(path.parent), "ls-files", "--", f":(literal){path.name}"]
-        try:
-            found = subprocess.run(command, capture_output=True, check=False).stdout
-        except FileNotFoundError:
-            return  # git is not installed
-        if path.exists() and found:
-            raise ConfigError(f"git tracks {path}; choose another path, or set overwrite=true")
 
 
 as_list = BeforeValidator(lambda value: [value] if isinstance(value, str) else value)
@@ -139,19 +123,29 @@ class EnvSettings(PluginSettings):
     @field_validator("env")
     @classmethod
     def _check_env(cls, env: dict[str, Any]) -> dict[str, Any]:
-        return without(env, **cls.set_by_command)
+        for name in cls.set_by_command.keys() & env:
+            raise ConfigError(
+                f"{name} is set by the command; leave it out, and {cls.set_by_command[name]}"
+            )
+        return env
 
 
-class VectorSettings(StrictModel):
-    """Settings of a vector of environments."""
+class VectorSettings(PluginSettings):
+    """Settings of a command that steps several environments together."""
 
     num_envs: NumEnvs = 5
     """Environments that step together."""
     parallel: bool | None = None
     """Worker processes; null for processes where at least three can run at a time."""
 
+    def make_env(self, task: str | ResolvedEnv, **fields: Any) -> closing[EnvBase]:
+        """Make environments of a task; the context that is returned closes them.
 
-def _short(path: str | Path) -> str:
-    """Return a path as text of at most 200 characters."""
-    text = str(path)
-    return text if len(text) <= 200 else f"{text[:100]}...{text[-80:]}"
+        Args:
+            task: id of the task, or its environment.
+            fields: further arguments of `ba_torchrl.make_vector_env`.
+        """
+        from ba_torchrl import make_vector_env
+
+        workers = {"parallel": self.parallel, "register_modules": self.plugins}
+        return closing(make_vector_env(task, self.num_envs, **workers, **fields))

@@ -12,33 +12,36 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections import Counter
-from dataclasses import dataclass
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from datetime import timedelta
+from functools import partial
 from pathlib import Path
-from typing import Any
+from statistics import fmean
+from typing import Any, NamedTuple
 
 from pydantic import Field
 
 from ba_torchrl.cli.command import Arguments, Command
-from ba_torchrl.cli.types import check_writable_folder
+from ba_torchrl.cli.types import TaskId, check_writable_folder
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig, choose
-from ba_torchrl.training.grid.plan import BenchmarkConfig, plan, split, status
+from ba_torchrl.training.grid.plan import BenchmarkConfig, Status, plan, split, status
 
 
 class Settings(BenchmarkConfig):
     """The grid, and what to do with it."""
 
+    tasks: list[TaskId] = Field(min_length=1)
+    """Ids of tasks."""
     dry_run: bool = False
     """List the runs and their states."""
     only: int | None = Field(default=None, ge=0)
     """Number of the only run to start, from 0 on, in the order of ``dry_run``."""
 
 
-@dataclass(frozen=True)
-class Task:
+class Task(NamedTuple):
     """A grid and its runs."""
 
     settings: Settings
@@ -56,27 +59,22 @@ def parse(values: dict[str, Any], _: Arguments) -> Task:
     return Task(settings, runs)
 
 
-def check(values: dict[str, Any]) -> None:
-    """Refuse wrong fields of the grid and unknown tasks, without torch."""
-    settings, _ = split(values, Settings)
-    for task in settings.tasks:
-        _ = TASKS[task]
-
-
 def main(task: Task) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
     from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
 
     config, runs, only = task.settings, task.runs, task.settings.only
-    if config.dry_run:
-        states = {run.run_dir: status(run) for run in runs}
-        for run in runs:
-            print(f"{run.task:36} {run.label:20} seed {run.seed:<3} {states[run.run_dir]}")
-        counts = Counter(state.state for state in states.values())
-        print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
-        return
-    if only is not None:
+    if only is not None and not config.dry_run:
         runs = [runs[only]]
+    states = [(run, status(run)) for run in runs]
+    if config.dry_run:
+        for run, state in states:
+            print(f"{run.task:36} {run.label:20} seed {run.seed:<3} {state}")
+        counts = Counter(state.state for _, state in states)
+        print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
+    print_estimate(states, config.jobs)
+    if config.dry_run:
+        return
     launcher = choose(LAUNCHERS, config.launcher, "launcher")
     launcher.check(runs)
     # the runs end with this process
@@ -89,12 +87,12 @@ def main(task: Task) -> None:
         raise
     finally:
         signal.signal(signal.SIGTERM, before)
-    states = {run.run_dir: status(run) for run in runs}
-    done = sum(state.state == "done" for state in states.values())
+    states = [(run, status(run)) for run in runs]
+    done = sum(state.state == "done" for _, state in states)
     print(f"{done} of {len(runs)} runs done in {config.folder}")
-    for folder, state in states.items():
+    for run, state in states:
         if state.state == "running":
-            print(f"  running {folder}: {state.detail}")
+            print(f"  running {run.run_dir}: {state.detail}")
     for folder, reason in failures.items():
         print(f"  failed  {folder}: {reason}")
     if failures:
@@ -103,4 +101,18 @@ def main(task: Task) -> None:
         print(f"  next    ba-torchrl report {config.folder}")
 
 
-COMMAND = Command(main, Settings, config="benchmark", parse=parse, check=check)
+def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], jobs: int) -> None:
+    """Print how long the runs take that are not done, if some of the same task and method are."""
+    seconds = defaultdict(list)
+    for run, state in states:
+        seconds[run.task, run.label] += [] if state.seconds is None else [state.seconds]
+    left = [seconds[run.task, run.label] for run, state in states if state.state != "done"]
+    known = [fmean(each) for each in left if each]
+    if known:
+        duration = timedelta(seconds=round(sum(known) / jobs))
+        print(f"about {duration} h for {len(known)} of {len(left)} runs, as finished ones took")
+
+
+COMMAND = Command(
+    main, Settings, config="benchmark", parse=parse, check=partial(split, model=Settings)
+)

@@ -2,7 +2,6 @@
 
 ba-torchrl collect task=close_loop/block_picking episodes=100 path=demos/picking
 ba-torchrl collect task=open_loop/house_building_4 source=deconstruction
-ba-torchrl collect task=open_loop/house_building_4 source=deconstruction replays=200
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.core.config import Source
 from ba_torchrl.core.files import complete_only
-from ba_torchrl.envs.settings import check_env, resolve_env
+from ba_torchrl.envs.settings import check_env
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
@@ -42,8 +41,6 @@ class Settings(VectorSettings, EnvSettings):
     """The expert's episodes, or structures that are taken apart, reversed in time."""
     episodes: Count = 100
     """Their number."""
-    replays: int = Field(default=0, ge=0)
-    """Deconstruction: number of episodes whose reversal is checked in the simulator."""
     only_successful: bool = True
     """Play others in place of failed episodes."""
     noise: float = Field(default=0.0, ge=0, lt=1)
@@ -65,69 +62,41 @@ class Settings(VectorSettings, EnvSettings):
 
 def main(settings: Settings) -> None:
     """Play the expert's episodes, or deconstruct structures, and write them into a folder."""
-    task = settings.task
+    task, source, seed = settings.task, settings.source, settings.seed
     check_env(task, settings.env)  # before the import of torch
-    from ba_torchrl import make_vector_env
-    from ba_torchrl.demonstrations.collect import (
-        check_noise,
-        check_turn_noise,
-        collect_demonstrations,
-        source_config,
-    )
+    if source == "deconstruction":
+        check_has_structure(task)
+    from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
     from ba_torchrl.demonstrations.demo_files import save_demonstrations
     from ba_torchrl.demonstrations.episodes import is_success, mean_length, success_rate
-    from ba_torchrl.demonstrations.time_reversal import replay_scores
 
-    path = settings.folder
-    actions = resolve_env(task, settings.env).actions
-    check_noise(settings.noise, settings.source, "noise")
-    check_turn_noise(settings.turn_noise, settings.source, actions.turns, "turn_noise")
-    if settings.source == "deconstruction":
-        check_has_structure(task)
-    with complete_only(path) as scratch:
-        env = make_vector_env(
-            task,
-            settings.num_envs,
-            parallel=settings.parallel,
-            register_modules=settings.plugins,
-            **{**settings.env, "seed": settings.seed, **source_config(settings.source)},
-        )
-        try:
-            with progress_bar(total=settings.episodes, unit="episode") as bar:
-                episodes = collect_demonstrations(
-                    env,
-                    settings.episodes,
-                    seed=settings.seed,
-                    source=settings.source,
-                    only_successful=settings.only_successful,
-                    noise=settings.noise,
-                    turn_noise=settings.turn_noise,
-                    turns=actions.turns,
-                    primitive=actions.primitive,
-                    on_episode=lambda episode: bar.update(
-                        is_success(episode) or not settings.only_successful
-                    ),
-                )
-        finally:
-            env.close()
+    fields = {**settings.env, **source_config(source)}
+    with complete_only(settings.folder) as scratch:
+        with (
+            settings.make_env(task, seed=seed, **fields) as env,
+            progress_bar(total=settings.episodes, unit="episode") as bar,
+        ):
+            episodes = collect_demonstrations(
+                env,
+                settings.episodes,
+                seed=seed,
+                source=source,
+                only_successful=settings.only_successful,
+                noise=settings.noise,
+                turn_noise=settings.turn_noise,
+                turns=env.resolved.actions.turns,
+                primitive=env.resolved.actions.primitive,
+                on_episode=lambda episode: bar.update(
+                    is_success(episode) or not settings.only_successful
+                ),
+            )
         save_demonstrations(
-            scratch,
-            episodes,
-            task=task,
-            env=settings.env,
-            seed=settings.seed,
-            source=settings.source,
+            scratch, episodes, task=task, env=settings.env, seed=seed, source=source
         )
     print(
         f"{len(episodes)} episodes of {task}, success {success_rate(episodes):.2f}, "
-        f"{mean_length(episodes):.1f} steps each, in {path}"
+        f"{mean_length(episodes):.1f} steps each, in {settings.folder}"
     )
-    if settings.replays and settings.source == "deconstruction":
-        scores = replay_scores(task, settings.replays, seed=settings.seed, **settings.env)
-        print(
-            f"of {settings.replays} structures taken apart {scores.reversible:.3f} can be "
-            f"reversed; played in the simulator, {scores.success_rate:.3f} of these reach the goal"
-        )
 
 
 COMMAND = Command(main, Settings, positional="task")

@@ -39,11 +39,7 @@ def main(settings: Settings) -> None:
     check_writable_file(path, suffixes=(TENSORS,))
     round_weights(policy)
     card = save_policy(policy, path, evaluate.play(policy, settings))
-    low, high = card.interval
-    print(
-        f"success_rate {card.success_rate:.2f} (95 % interval {low:.2f} to {high:.2f}) over "
-        f"{card.episodes} episodes of {card.task}"
-    )
+    print(evaluate.success_text(card.success_rate, card.episodes, card.task))
     print(f"  policy  {path}, {path.stat().st_size / 1e6:.2f} MB")
     named = f"policy={path.name}"  # the card may be moved with its file
     words = [f"policy={path}" if word == named else word for word in shlex.split(card.evaluate)]

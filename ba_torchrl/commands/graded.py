@@ -43,14 +43,7 @@ def main(settings: Settings) -> None:
         raise ConfigError("tasks: name each one once")
     of_tasks = [
         GradedSets(
-            Path(settings.path, task),
-            task,
-            settings.episodes,
-            settings.env,
-            settings.seed,
-            settings.num_envs,
-            settings.parallel,
-            settings.plugins,
+            Path(settings.path, task), task, **settings.model_dump(exclude={"tasks", "path"})
         )
         for task in settings.tasks
     ]

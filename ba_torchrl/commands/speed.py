@@ -8,8 +8,9 @@ ba-torchrl speed close_loop/block_picking env.obs_size=128 'networks=[equi]' dev
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
@@ -20,13 +21,10 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 
-if TYPE_CHECKING:
-    import torch
-
 LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn")}
 """Algorithm and usual network by control."""
-WARM_UP_UPDATES = 5
-"""First updates, which are slower than later ones and not measured."""
+WARM_UP_UPDATES, WARM_UP_STEPS = 5, 2
+"""First calls, which are slower than later ones and not measured."""
 
 
 class Settings(EnvSettings):
@@ -64,12 +62,12 @@ def main(settings: Settings) -> None:
     learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
     print(f"{'':52} {'per second':>10}")
     for task in settings.tasks:
-        for name, workers in (
-            ("one environment", {"num_envs": 1, "parallel": False}),
-            (f"{settings.num_envs} in this process", {"parallel": False}),
-            (f"{settings.num_envs} processes", {"parallel": True}),
+        for name, num_envs, parallel in (
+            ("one environment", 1, False),
+            (f"{settings.num_envs} in this process", settings.num_envs, False),
+            (f"{settings.num_envs} processes", settings.num_envs, True),
         ):
-            rate = steps_per_second(task, settings, **{"num_envs": settings.num_envs, **workers})
+            rate = steps_per_second(task, settings, num_envs, parallel)
             print(f"{task:34} {name:17} {rate:10.1f} steps")
         for config in learners[task]:
             rate = updates_per_second(config, settings)
@@ -81,74 +79,69 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import expert_policy
 
-    env = make_vector_env(
-        task,
-        num_envs,
-        parallel=parallel,
-        register_modules=settings.plugins,
-        seed=settings.seed,
-        expert=True,
-        **settings.env,
-    )
-    steps = -(-settings.steps // num_envs)
-    try:
+    options = {**settings.env, "parallel": parallel, "register_modules": settings.plugins}
+    env = make_vector_env(task, num_envs, **options, seed=settings.seed, expert=True)
+    with closing(env):
         state = env.reset()
-        for _ in range(2):  # builds the images' caches
+
+        def step() -> None:
+            nonlocal state
             _, state = env.step_and_maybe_reset(expert_policy(state))
-        start = time.perf_counter()
-        for _ in range(steps):
-            _, state = env.step_and_maybe_reset(expert_policy(state))
-        return steps * num_envs / (time.perf_counter() - start)
-    finally:
-        env.close()
+
+        return num_envs * _rate(step, WARM_UP_STEPS, -(-settings.steps // num_envs))
 
 
 def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
     """Yield the configuration of each learner that is measured on a task."""
     algorithm, usual = LEARNERS[TASKS[task].control]
     for network in (settings.networks or [usual]) if settings.updates else ():
+        values = settings.model_dump(include={"plugins", "env", "device", "seed"})
         yield ExperimentConfig.parse(
             {
-                "plugins": settings.plugins,
+                **values,
                 "task": task,
-                "env": settings.env,
                 "algorithm": {"name": algorithm},
                 "network": hydra_schema.preset("network", network),
                 "label": f"{algorithm} {network}",
-                "device": settings.device,
-                "seed": settings.seed,
             }
         )
 
 
 def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
     """Return the updates of a learner per second, with a replay of a few demonstrations."""
+    import torch
+
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.training.learner import build_algorithm
 
     algorithm = build_algorithm(config)
-    env = make_vector_env(config.resolved_env, 1, parallel=False, seed=settings.seed, expert=True)
-    try:
-        episodes = collect_demonstrations(env, 5, seed=settings.seed)
-    finally:
-        env.close()
-    algorithm.on_demonstrations(episodes)
-    for _ in range(min(WARM_UP_UPDATES, settings.updates)):
-        algorithm.update()
-    _wait(config.torch_device)
+    options = {"parallel": False, "seed": settings.seed, "expert": True}
+    with closing(make_vector_env(config.resolved_env, 1, **options)) as env:
+        algorithm.on_demonstrations(collect_demonstrations(env, 5, seed=settings.seed))
+
+    def wait() -> None:
+        if config.torch_device.type == "cuda":
+            torch.cuda.synchronize(config.torch_device)
+
+    return _rate(algorithm.update, WARM_UP_UPDATES, settings.updates, wait)
+
+
+def _rate(
+    call: Callable[[], object],
+    warm_up: int,
+    times: int,
+    wait: Callable[[], object] = lambda: None,
+) -> float:
+    """Return how often a function can be called in a second; ``wait`` ends what it started."""
+    for _ in range(min(warm_up, times)):
+        call()
+    wait()
     start = time.perf_counter()
-    for _ in range(settings.updates):
-        algorithm.update()
-    _wait(config.torch_device)
-    return settings.updates / (time.perf_counter() - start)
-
-
-def _wait(device: torch.device) -> None:
-    import torch
-
-    if device.type == "cuda":
-        torch.cuda.synchronize(device)
+    for _ in range(times):
+        call()
+    wait()
+    return times / (time.perf_counter() - start)
 
 
 COMMAND = Command(main, Settings, positional="tasks")

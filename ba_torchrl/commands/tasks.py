@@ -2,17 +2,16 @@
 
 ba-torchrl tasks
 ba-torchrl tasks close_loop/block_picking
-ba-torchrl tasks path=docs/tasks.md overwrite=true
+ba-torchrl tasks path=docs/tasks.md
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from pathlib import Path
 
 from ba_torchrl import describe, list_tasks
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks, check_untracked
+from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks
 from ba_torchrl.core.files import write_text
 from ba_torchrl.envs.description import summary, tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
@@ -25,18 +24,13 @@ class Settings(PluginSettings):
     """Ids of tasks; null for all."""
     path: OutputFile | None = None
     """Write the page of the tasks, in Markdown, to this file."""
-    overwrite: bool = False
-    """Also write over a file that git tracks."""
 
 
 def main(settings: Settings) -> None:
     """Print or write what is known of the tasks."""
     if settings.path is not None:
-        path = Path(settings.path)
-        if not settings.overwrite:
-            check_untracked([path])
         tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
-        print(write_text(path, page(settings.tasks or tasks)))
+        print(write_text(settings.path, page(settings.tasks or tasks)))
     elif settings.tasks is not None:
         print("\n\n".join(str(describe(task)) for task in settings.tasks))
     else:

@@ -29,7 +29,6 @@ RUN = {
 }
 LONG = 300 * "n"
 REFUSED = [
-    ("train", "threads=100000", "threads: Input should be less than or equal to 1024"),
     (
         "train",
         "algorithm.optimizer.learning_rate=1e300",
@@ -38,8 +37,6 @@ REFUSED = [
     ("train", "run_dir=file", "it is not a folder"),
     ("train", "run_dir=/dev/full/x", "cannot write to "),
     ("benchmark", "only=9999", "only: must be a number from 0 to "),
-    ("benchmark", "only=-5", "only: Input should be greater than or equal to 0"),
-    ("benchmark", "dry_run=maybe", "dry_run: Input should be a valid boolean"),
     ("benchmark", "seeds=100000000000", "seeds"),
     ("benchmark", "folder=file", "it is not a folder"),
     ("collect", "foo=1", "unknown setting 'foo'. Known: "),
@@ -52,21 +49,15 @@ REFUSED = [
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("collect", "plugins=[json.py]", "there is no module 'json.py'. Leave out '.py', run from"),
     ("play", "env.seed=5", "leave it out, and set seed"),
-    ("play", "env.expert=true", "leave it out, and set policy"),
     ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),
-    ("experts", "env.num_objects=3", "unknown setting 'env'. Known: plugins, num_envs, "),
-    ("experts", "variants.close_loop=null", "variants.close_loop: Input should be a valid dict"),
-    ("experts", "variants.open_loop.x={seed: 3}", "variants: seed is set by the command"),
+    ("experts", "env.robot=ur5", "env: robot is set by the command; leave it out, and set robots"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
     ("plot", "runs=[run]", "cannot read the scalars of run"),
     ("report", "runs=run", "no finished run below run"),
     ("leaderboard", "runs=demos", "no run below demos"),
     ("report", "folder=file/x", "cannot write to "),
-    ("soak", "env.seed=3", "leave it out, and set seed"),
     ("soak", "tasks=[mine/none]", "unknown task 'mine/none'"),
-    ("soak", "steps=1", "steps"),
-    ("speed", "foo=1", "unknown"),
     ("measure", "output=folder.json", "cannot write to "),
 ]
 REQUIRED = {
@@ -124,10 +115,6 @@ def test_play_says_whether_each_episode_succeeded(capsys):
 @pytest.mark.parametrize(
     ("kind", "right", "wrong"),
     [
-        ("Count", 1, [0, -3, 1.5, "many", True, None]),
-        ("NumEnvs", 1024, [0, 3000]),
-        ("Seed", 2**52 - 1, [-1, 0.5, "many", 2**52]),
-        ("Text", "a", ["", None, 3]),
         ("Plugins", ["json"], ["json", [""], ["no_such_module"], 3]),
         ("Tasks", None, [3, [], ["close_loop/none"], [1]]),
         ("Folders", "run", ["nope", [], ["nope"], 5, None, [1], LONG]),
@@ -180,52 +167,33 @@ def test_a_small_shared_memory_is_refused(monkeypatch):
         ba_torchrl.make_vector_env("close_loop/block_reaching", 2, start_method="fork")
 
 
-def test_an_interruption_outside_of_a_run_is_one_line(capsys):
-    @plain_errors
-    def main(settings):
-        raise KeyboardInterrupt
-
-    with pytest.raises(SystemExit) as end:
-        main(None)
-    assert end.value.code == 130
-    assert capsys.readouterr().err == "stopped by SIGINT\n"
-
-
-def test_errors_of_resources_are_one_line(capsys):
-    @plain_errors
-    def full(_):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with pytest.raises(SystemExit):
-        full(None)
-    assert capsys.readouterr().err == "error: [Errno 28] No space left on device\n"
-
-    @plain_errors
-    def broken(_):
-        raise OSError(errno.EINVAL, "a defect")
-
-    with pytest.raises(OSError, match="a defect"):
-        broken(None)
-
-
 @pytest.mark.parametrize(
-    "error",
+    ("error", "line"),
     [
-        MemoryError("Unable to allocate 7 TiB"),
-        RuntimeError("DefaultCPUAllocator: can't allocate memory: you tried to\nallocate 7 TiB"),
-        torch.OutOfMemoryError("CUDA out of memory"),
+        (KeyboardInterrupt(), "stopped by SIGINT\n"),
+        (OSError(errno.ENOSPC, "No space left"), "error: [Errno 28] No space left\n"),
+        (RuntimeError("x.safetensors: Too many open files (24)"), "error: [Errno 24] Too many "),
+        (MemoryError("Unable to allocate 7 TiB"), "error: out of memory: Unable to"),
+        (RuntimeError("can't allocate memory: you tried to\nallocate"), "error: out of memory: "),
+        (torch.OutOfMemoryError("CUDA out of memory"), "error: out of memory: CUDA"),
     ],
 )
-def test_a_lack_of_memory_is_one_line(error, capsys):
-    @plain_errors
-    def large(_):
-        raise error
-
+def test_an_interruption_and_errors_of_resources_are_one_line(error, line, capsys):
     with pytest.raises(SystemExit):
-        large(None)
-    line = capsys.readouterr().err
-    assert line.startswith("error: out of memory: ")
-    assert line.count("\n") == 1
+        raised(error)
+    found = capsys.readouterr().err
+    assert found.startswith(line)
+    assert found.count("\n") == 1
+
+
+@plain_errors
+def raised(error):
+    raise error
+
+
+def test_a_defect_is_no_error_of_resources():
+    with pytest.raises(OSError, match="a defect"):
+        raised(OSError(errno.EINVAL, "a defect"))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root can write everywhere")

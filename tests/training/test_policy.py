@@ -14,7 +14,6 @@ from tensordict import TensorDict
 from torchrl.envs import StepCounter, TransformedEnv
 
 import ba_torchrl
-from ba_torchrl.commands import evaluate
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import RunResult, TestedPolicy, read_result
 from ba_torchrl.tasks.base import TASKS
@@ -303,53 +302,25 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF")
 
 
-def test_records_of_the_shipped_policies_are_kept_and_give_the_cards_their_numbers(
-    tmp_path, capsys, monkeypatch
-):
-    task, played = "close_loop/block_picking", []
-
-    def play(policy, settings):
-        played.append(settings.episodes)
-        return with_outcomes(*[0, 1] * (settings.episodes // 2))
-
-    monkeypatch.setattr(evaluate, "play", play)
-    monkeypatch.setattr(policies, "shipped_policies", lambda: [task])
-    words = ("trained", f"folder={tmp_path}", "episodes=20")
-    recipe("evaluate", *words)
-    first = capsys.readouterr().out
-    recipe("evaluate", *words)
-    assert capsys.readouterr().out == first
-    assert "success_rate 0.50 (95 % interval 0.30 to 0.70) over 20 episodes" in first
-    assert "not citable: fewer than 200 episodes" in first
-    (file,) = tmp_path.glob("close_loop_block_picking.json")
-    record = RunResult.model_validate_json(file.read_bytes())
-    assert (record.last.successes, record.best) == ([0, 1] * 10, record.last)
-    with pytest.raises(ValueError, match="20 episodes; evaluate with episodes=500"):
-        shipped_records.take(file)
-    for changed in (
-        file.read_text()[:-9],
-        record.model_copy(update={"task_version": 1}).model_dump_json(),
-        record.model_copy(update={"policy_file": "0"}).model_dump_json(),
-    ):
-        file.write_text(changed)
-        recipe("evaluate", *words)
-    recipe("evaluate", task, *words[1:], "num_envs=2")
-    assert played == [20] * 4
-    recipe("evaluate", *words[:2], "episodes=200")
+def test_the_test_of_a_shipped_policy_gives_its_record_and_its_card(tmp_path, monkeypatch):
+    task = "close_loop/block_picking"
+    monkeypatch.setattr(
+        shipped_records, "play", lambda _, settings: with_outcomes(*[0, 1] * settings.episodes)
+    )
     for name in (policies.TENSORS, policies.CARD):
         shutil.copy(policies.shipped_file(task).with_suffix(name), tmp_path / f"p{name}")
     monkeypatch.setattr(shipped_records, "shipped_file", lambda _: tmp_path / "p.safetensors")
     monkeypatch.setattr(shipped_records, "RECORDS", tmp_path / "results")
-    assert shipped_records.take(file) == f"{task}: 0.500 over 200 episodes"
+    assert not shipped_records.is_recorded(task)
+    assert shipped_records.take(task, 100) == f"{task}: 0.500 over 200 episodes"
+    record = RunResult.model_validate_json(shipped_records.record_file(task).read_bytes())
+    assert (record.last.successes, record.best) == ([0, 1] * 100, record.last)
     card = policies.read_card(tmp_path / "p.safetensors")
     assert (card.success_rate, card.episodes, card.protocol) == (0.5, 200, 1)
     assert card.evaluate == f"ba-torchrl evaluate policy={task} episodes=200"
+    assert shipped_records.is_recorded(task)
     (tmp_path / "p.safetensors").write_bytes(b"other")
-    with pytest.raises(ValueError, match=f"another policy of {task} is shipped"):
-        shipped_records.take(file)
-    with pytest.raises(SystemExit):
-        recipe("evaluate", *words, "seed=3")
-    assert "under the protocol; leave out seed" in capsys.readouterr().err
+    assert not shipped_records.is_recorded(task)
 
 
 def test_a_shipped_policy_has_one_number_in_card_and_record():

@@ -112,6 +112,8 @@ class Status:
 
     state: State
     detail: str = ""
+    seconds: float | None = None
+    """Wall time of a run that is done."""
 
     def __str__(self) -> str:
         return f"{self.state}: {self.detail}" if self.detail else self.state
@@ -223,7 +225,8 @@ def status(run: ExperimentConfig) -> Status:
         # settings that are newer than the run have their defaults
         started = parse_saved(result.config, folder / RESULT_FILE, device=run.device)
         check_same_run(run, started, Versions(result.task_version, result.expert_version))
-        return Status("done", f"success {result.last.success_rate:.2f}")
+        success = f"success {result.last.success_rate:.2f}"
+        return Status("done", success, result.seconds)
     if (folder / CONFIG_FILE).exists():
         try:
             started = read_config(folder, device=run.device)

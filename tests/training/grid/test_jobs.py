@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -374,7 +375,9 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
     out = capsys.readouterr().out
     assert "1 of 2 runs done" in out
     assert "failed  " in out
-    assert "2 runs: 1 done, 1 failed" in printed("seeds=2", "dry_run=true")
+    listed = printed("seeds=2", "dry_run=true")
+    assert "2 runs: 1 done, 1 failed" in listed
+    assert re.search(r"about 0:00:\d\d h for 1 of 1 runs", listed)
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt
