@@ -29,6 +29,8 @@ SOURCES: tuple[Source, ...] = get_args(Source)
 
 def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
     """Copy the expert's action; the environment must be made with ``expert=True``."""
+    if keys.EXPERT_ACTION not in tensordict:
+        raise ConfigError("there is no expert's action: make the environment with expert=True")
     return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION].clone())
 
 

@@ -9,7 +9,8 @@ from typing import Any
 
 import torch
 from tensordict import TensorDict, TensorDictBase
-from torchrl.envs import EnvBase
+from torchrl.envs import EnvBase, TransformedEnv
+from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
@@ -65,16 +66,21 @@ def collect_episodes(
         Episodes as TensorDicts [T], in the order of the environments.
 
     Raises:
-        ConfigError: a trained policy is for another environment, or too few episodes are kept.
+        ConfigError: the environment is no vector, a trained policy is for another one, or too few
+            episodes are kept.
         RuntimeError: more than `MAX_LOST` episodes were lost to faults.
     """
     check_policy(policy, env)
+    if len(env.batch_size) != 1:
+        raise ConfigError(
+            f"{env} is no vector; for a single one: make_vector_env(task, 1, parallel=False)"
+        )
     (num_envs,) = env.batch_size
     wanted = quotas(episodes, num_envs)
     finished: list[list[TensorDict]] = [[] for _ in wanted]
     current: list[list[TensorDict]] = [[] for _ in wanted]
     lost = dropped = 0
-    state = env.reset() if seed is None else env.reset(seed=seed)
+    state = env.reset() if seed is None else _reset_with_seeds(env, seed)
     while any(len(done) < quota for done, quota in zip(finished, wanted, strict=True)):
         step, state = env.step_and_maybe_reset(policy(state))
         if results_only:
@@ -107,6 +113,16 @@ def collect_episodes(
                     "take failed ones too, less noise or another source"
                 )
     return [episode for done in finished for episode in done]
+
+
+def _reset_with_seeds(env: EnvBase, seed: int) -> TensorDictBase:
+    """Reset environment i with ``seed + i``."""
+    vector = env
+    while isinstance(vector, TransformedEnv):
+        vector = vector.base_env
+    if isinstance(vector, BatchedEnvBase):  # it would give all environments the same seed
+        return env.reset(list_of_kwargs=[{"seed": seed + i} for i in range(vector.num_workers)])
+    return env.reset(seed=seed)
 
 
 @torch.no_grad()

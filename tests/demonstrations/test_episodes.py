@@ -1,6 +1,9 @@
+from functools import partial
+
 import pytest
 import torch
 from tensordict import TensorDict
+from torchrl.envs import SerialEnv, TransformedEnv
 
 import ba_torchrl
 from ba_torchrl.core import keys
@@ -48,6 +51,26 @@ def test_each_environment_plays_its_quota_and_short_episodes_are_not_favoured(ex
     assert lengths[6:] == [10, 10]
     assert success_rate(episodes) == 6 / 8
     assert mean_length(episodes) == sum(lengths) / 8
+
+
+@pytest.mark.parametrize("wrap", [lambda env: env, TransformedEnv], ids=["bare", "transformed"])
+def test_vectors_of_torchrl_play_the_same_episodes(expert_env, wrap):
+    one = partial(ba_torchrl.make, TASK, expert=True, obs_size=16, seed=0, max_steps=10)
+    vector = wrap(SerialEnv(3, one))
+    found, expected = (collect_demonstrations(env, 3, seed=5) for env in (vector, expert_env))
+    vector.close()
+    for a, b in zip(found, expected, strict=True):
+        assert torch.equal(a["depth"], b["depth"])
+
+
+def test_an_environment_that_cannot_play_demonstrations_is_refused():
+    env = ba_torchrl.make(TASK, obs_size=16, expert=True)
+    with pytest.raises(ConfigError, match=r"is no vector; .*make_vector_env\(task, 1"):
+        collect_demonstrations(env, 1)
+    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, obs_size=16)
+    with pytest.raises(ConfigError, match="make the environment with expert=True"):
+        collect_demonstrations(env, 1)
+    env.close()
 
 
 def test_episodes_are_whole_and_repeat_with_the_seed(expert_env):
