@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import pkgutil
+import re
 import sys
 from collections.abc import Callable, Iterator
 from typing import Generic, TypeVar
@@ -13,6 +14,7 @@ from ba_torchrl.core.plugins import load_entry_points
 
 T = TypeVar("T")
 
+_NAME = re.compile(r"[\w.-]+(/[\w.-]+)*")
 PACKAGE = __name__.partition(".")[0]
 
 _LISTENERS: dict[str, list[Callable[[str], None]]] = {}
@@ -54,8 +56,13 @@ class Registry(Generic[T]):
         new definition replaces the old one.
 
         Raises:
-            ConfigError: another object already has that name.
+            ConfigError: another object already has that name, or it is not one.
         """
+        if not isinstance(name, str) or not _NAME.fullmatch(name):
+            raise ConfigError(
+                f"register takes a name such as 'mine/{self.kind.replace(' ', '_')}', of letters, "
+                f"digits, '_', '-', '.' and '/', not {name!r}"
+            )
         module = sys._getframe(1).f_globals.get("__name__", "__main__")
 
         def decorate(entry: T) -> T:

@@ -17,7 +17,7 @@ from torchrl.envs.utils import _classproperty
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.envs.checks import ChecksPolicy, check_seed, checked_action
+from ba_torchrl.envs.checks import ChecksPolicy, check_entries, check_seed, checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_bodies, check_observation
 from ba_torchrl.envs.observations import (
@@ -480,7 +480,9 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
                     scene = self._episodes.begin(rng, with_new_objects=with_new_objects)
                     self._progress = self._measure_progress(scene)
                     self._instruction = scene.task.instruction()
-                    return self._observe(scene)
+                    observation = self._observe(scene)
+                    check_entries(observation, self.observation_spec)
+                    return observation
             except SIMULATOR_ERRORS:
                 self._on_fault()
 

@@ -1,17 +1,18 @@
-"""Validation of actions before they are executed, of policies before they act, and of seeds."""
+"""Validation of actions and seeds before they are used, of policies, and of what is observed."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import torch
 from tensordict import TensorDictBase
-from torchrl.data import TensorSpec
+from torchrl.data import Composite, NonTensor, TensorSpec
 from torchrl.envs import EnvBase
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import InvalidActionError
+from ba_torchrl.core.errors import ConfigError, InvalidActionError
 
 
 class ChecksPolicy:
@@ -35,6 +36,26 @@ def check_seed(seed: int) -> None:
     """Check that a seed is a natural number."""
     if not isinstance(seed, int | np.integer) or isinstance(seed, bool) or seed < 0:
         raise ValueError(f"a seed must be a natural number, got {seed!r}")
+
+
+def check_entries(observation: Mapping[str, Any], specs: Composite) -> None:
+    """Check that the entries of an observation have the keys, types and shapes of ``specs``."""
+    specified = set(specs.keys()) - {keys.SUCCESS, keys.FAULT, keys.STEP_COUNT}
+    if specified != observation.keys():
+        raise ConfigError(
+            f"observations: {', '.join(sorted(specified ^ observation.keys()))} is either observed "
+            "or specified, not both"
+        )
+    for key, value in observation.items():
+        spec = specs[key]
+        if isinstance(spec, NonTensor):
+            continue
+        found = (getattr(value, "dtype", type(value)), tuple(getattr(value, "shape", ())))
+        if found != (spec.dtype, tuple(spec.shape)):
+            raise ConfigError(
+                f"observations: {key} has {found[0]} {list(found[1])}, its specification "
+                f"{spec.dtype} {list(spec.shape)}"
+            )
 
 
 def checked_action(action: torch.Tensor | None, task_id: str, action_sequence: str) -> np.ndarray:

@@ -125,6 +125,12 @@ def test_registry_refuses_two_entries_of_one_name():
         registry["b"]
 
 
+@pytest.mark.parametrize("name", [object, "", 3, "mine/my task"])
+def test_registry_refuses_what_is_no_name(name):
+    with pytest.raises(ConfigError, match="register takes a name such as 'mine/thing'"):
+        Registry("thing", "ba_torchrl.tasks.close_loop").register(name)
+
+
 def test_list_tasks_is_sorted_and_complete():
     tasks = ba_torchrl.list_tasks()
     assert tasks == sorted(tasks)

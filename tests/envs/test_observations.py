@@ -15,6 +15,7 @@ import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.gym import GymEnv
+from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix
 from ba_torchrl.tasks.instructions import color_name
 from tests.tasks.episodes import follow_expert
@@ -48,6 +49,22 @@ def test_all_observations_together_follow_their_specs(make):
     assert state["rgb"].shape == state["wrist_rgb"].shape == (3, 40, 40)
     assert state["rgb_depth"].shape == state["segmentation"].shape == (1, 40, 40)
     assert env.vectors == {"proprio": 8, "joints": 7}
+
+
+@pytest.mark.parametrize(
+    ("entries", "message"),
+    [
+        ({"joints": torch.zeros(3)}, r"joints has torch.float32 \[3\], its .* torch.float32 \[7\]"),
+        ({"joints": torch.zeros(7).double()}, "joints has torch.float64"),
+        ({"joints": np.zeros(7, np.float32)}, "joints has float32"),
+        ({"joints": 0.0}, "joints has <class 'float'>"),
+        ({"angles": torch.zeros(7)}, "angles, joints is either observed or specified"),
+    ],
+)
+def test_an_observation_that_is_not_as_specified_is_refused(make, monkeypatch, entries, message):
+    monkeypatch.setattr(OBSERVATIONS["joints"], "observe", lambda self, scene: entries)
+    with pytest.raises(ConfigError, match=message):
+        make(PICKING, "joints").reset()
 
 
 def test_proprioception_is_the_tools_pose_and_the_opening(make):
