@@ -7,6 +7,7 @@ from functools import partial
 from types import ModuleType
 from typing import Any
 
+import torch
 from torchrl.envs import EnvBase
 
 from ba_torchrl.core.config import WorkerOptions, parse
@@ -36,6 +37,7 @@ def make_vector_env(
     workers: WorkerOptions | None = None,
     register_modules: Sequence[str | ModuleType] = (),
     make: Callable[[ResolvedEnv], BulletArmEnv] = make,
+    device: torch.device | str | int | None = None,
     **options: Any,
 ) -> EnvBase:
     """Make ``num_envs`` environments that step together.
@@ -51,6 +53,7 @@ def make_vector_env(
             environment, such as ``["my_tasks"]``. Those that register the task and the robot are
             found without being named.
         make: makes one environment; a function or class that the processes can import.
+        device: of the vector's TensorDicts, the CPU by default.
         options: as for `make`, and single fields of `ba_torchrl.core.config.WorkerOptions`, such as
             ``parallel=False`` or ``timeout_s=120``.
     """
@@ -66,4 +69,4 @@ def make_vector_env(
         resolved.check_spawned_process_knows()
     env = make_vector(partial(make, resolved), num_envs, seed=resolved.config.seed, workers=workers)
     env.resolved = resolved
-    return env
+    return env if device is None else env.to(device)

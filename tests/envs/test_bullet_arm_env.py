@@ -91,6 +91,9 @@ def test_the_device_is_that_of_specifications_and_outputs():
     assert {str(env.device), str(state.device), state["depth"].device.type} == {"meta"}
     assert env.action_spec.device.type == env.observation_spec["depth"].device.type == "meta"
     env.close()
+    vector = ba_torchrl.make_vector_env(TASK, 2, parallel=False, obs_size=16, device="cpu")
+    assert vector.reset().device == vector.device == torch.device("cpu")
+    vector.close()
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -110,6 +113,9 @@ def test_an_environment_whose_tensors_are_on_a_gpu(task):
     assert len(first.get_position()["actions"][0]) == 2
     kept = first.get_state()
     assert first.reset(kept, set_state=True).device.type == "cuda"
+    vector = ba_torchrl.make_vector_env(task, 2, parallel=False, device="cuda")
+    check_env_specs(vector)
+    vector.close()
     first.close()
     second.close()
 

@@ -8,6 +8,8 @@ import shutil
 from collections.abc import Sequence
 from pathlib import Path
 
+import numpy as np
+
 from ba_torchrl.core.config import MAX_ENVS, WorkerOptions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector.batching import MakeEnv, SerialVectorEnv, Vector
@@ -54,8 +56,8 @@ def make_vector(
             ``num_envs``.
         RuntimeError: a worker could not be started.
     """
-    if num_envs < 1:
-        raise ValueError(f"num_envs must be at least 1, got {num_envs}")
+    if not isinstance(num_envs, int | np.integer) or num_envs < 1:
+        raise ValueError(f"num_envs must be a number of at least 1, got {num_envs!r}")
     if not callable(make_env) and len(make_env) != num_envs:
         raise ValueError(f"{len(make_env)} functions were given for {num_envs} environments")
     if num_envs > MAX_ENVS:

@@ -242,9 +242,10 @@ class TestResources:
             torch.set_num_threads(before)
 
 
-def test_refuses_impossible_sizes():
+@pytest.mark.parametrize("number", [0, 2.0, "2"])
+def test_refuses_impossible_sizes(number):
     with pytest.raises(ValueError, match="at least 1"):
-        make_vector(FakeEnv, 0)
+        make_vector(FakeEnv, number)
     with pytest.raises(ValueError, match="2 functions were given for 3"):
         make_vector([FakeEnv, FakeEnv], 3)
 
