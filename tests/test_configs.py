@@ -54,18 +54,24 @@ def networks_for(control):
 
 
 @pytest.mark.parametrize("algorithm", ALGORITHMS)
-def test_every_algorithm_composes_with_a_network_of_its_control_only(algorithm):
+def test_every_algorithm_composes_with_a_network_of_its_control(algorithm):
     for control in sorted(controls_of(algorithm)):
         overrides = [f"task={TASK_OF[control]}", f"algorithm={algorithm}", "seed=3"]
         network = networks_for(control)[0]
-        other = networks_for({"close_loop": "open_loop", "open_loop": "close_loop"}[control])[0]
-        with pytest.raises(ConfigError, match="network"):
-            experiment("train", *overrides, f"network={other}")
         config = experiment("train", *overrides, f"network={network}")
         method = "sacfd_per_so2" if algorithm == "sacfd" else algorithm
         assert config.label == f"{method} {network}"
         name = TASK_OF[control].replace("/", "_")
         assert config.run_dir.endswith(f"{name}-{method}_{network}-seed3")
+
+
+@pytest.mark.parametrize(
+    ("task", "algorithm", "network"),
+    [(TASK_OF["close_loop"], "bc", "asr"), (TASK_OF["open_loop"], "bc", "cnn")],
+)
+def test_a_network_of_the_other_control_is_refused(task, algorithm, network):
+    with pytest.raises(ConfigError, match="network"):
+        experiment("train", f"task={task}", f"algorithm={algorithm}", f"network={network}")
 
 
 @pytest.mark.parametrize("network", NETWORKS)
@@ -77,6 +83,7 @@ def test_every_network_composes(network):
     assert experiment("train", *overrides).label == f"{algorithm} {network}"
 
 
+@cache
 def method(name):
     hydra_schema.register()
     with initialize_config_dir(str(CONFIGS), version_base="1.3"):
@@ -133,7 +140,7 @@ def test_methods_that_do_not_exist_are_refused(name, message):
 def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
     """The values of a quick start are those of its algorithm: sac gets no behaviour term."""
     is_open_loop = name in ("quickstart_open_loop", "quickstart_six_dof")
-    for algorithm in ("dqn", "bc") if is_open_loop else ("sac", "rad", "bc"):
+    for algorithm in ("dqn",) if is_open_loop else ("sac", "bc"):
         config = experiment(name, f"algorithm={algorithm}")
         assert config.label.startswith(f"{algorithm} ")
         assert config.algorithm_config == method(algorithm)

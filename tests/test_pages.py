@@ -6,7 +6,6 @@ import importlib
 import re
 import shlex
 import shutil
-from functools import cache
 from pathlib import Path
 
 import pytest
@@ -45,38 +44,34 @@ def blocks(page: Path, language: str) -> list[str]:
     return [text for info, text in fences if info == language]
 
 
-def scripts() -> list[tuple[str, str, str]]:
-    """Return the name of each script, its source, and the modules that its page shows.
+def scripts(page: Path) -> list[str]:
+    """Return the sources of a page's scripts.
 
     A block that begins with a docstring is a module, `my_tasks`. One that imports something
     starts a script, on the page of a tutorial the first one; others continue it.
     """
     found = []
-    for page in PAGES:
-        python = blocks(page, "python")
-        modules = "".join(block for block in python if block.startswith('"""'))
-        is_begun = False
-        for block in python:
-            if block.startswith('"""'):
-                continue
-            if not is_begun and re.match(r"(?s).*^(import|from) ", block, re.MULTILINE):
-                found.append([f"{page.name} {len(found)}", "", modules])
-                is_begun = page in TUTORIALS
-            found[-1][1] += block
-    return [tuple(script) for script in found]
+    for block in blocks(page, "python"):
+        if block.startswith('"""'):
+            continue
+        begins = re.match(r"(?s).*^(import|from) ", block, re.MULTILINE)
+        if begins and not (found and page in TUTORIALS):
+            found.append("")
+        found[-1] += block
+    return found
 
 
-def command_lines(pages: list[Path] = PAGES) -> list[tuple[str, str]]:
+def command_lines(pages: list[Path] = PAGES) -> list[str]:
     found = set()
     for page in pages:
         lines = (
             "".join([*blocks(page, ""), *blocks(page, "bash")]).replace("\\\n", " ").splitlines()
         )
         lines += re.findall(r"`(ba-torchrl [^`\n]+)`", page.read_text())
-        found |= {(page.name, line.split("  #")[0].strip()) for line in lines}
+        found |= {line.split("  #")[0].strip() for line in lines}
     return sorted(
-        (page, line)
-        for page, line in found
+        line
+        for line in found
         if line.startswith("ba-torchrl ") and not re.search(r"\.\.\.|=NAME|\[my_", line)
     )
 
@@ -105,42 +100,48 @@ def test_brackets_in_a_command_of_a_help_or_a_configuration_are_quoted(capsys):
     assert unquoted("\n".join([*texts, *comments])) == []
 
 
-@pytest.fixture(scope="module")
-def demonstrations(tmp_path_factory):
-    """Return a function from a page to a folder with two episodes, as its `ba-torchrl collect`
-    writes it."""
-
-    @cache
-    def collected(page):
-        folder = tmp_path_factory.mktemp("demos") / "picking"
-        (line,) = (line for _, line in command_lines([page]) if f" path={DEMONSTRATIONS}" in line)
-        words = line.replace(DEMONSTRATIONS, str(folder)).replace("=100", "=2").split()[2:]
-        words += ["num_envs=1", "parallel=false"]
-        importlib.import_module("ba_torchrl.commands.collect").COMMAND.run(words)
-        return folder
-
-    return collected
+def collect(page: Path, folder: Path) -> None:
+    """Write two episodes, as the page's `ba-torchrl collect` does."""
+    (line,) = (line for line in command_lines([page]) if f" path={DEMONSTRATIONS}" in line)
+    words = line.replace(DEMONSTRATIONS, str(folder)).replace("=100", "=2").split()[2:]
+    words += ["num_envs=1", "parallel=false"]
+    importlib.import_module("ba_torchrl.commands.collect").COMMAND.run(words)
 
 
 @pytest.mark.parametrize(
-    ("name", "script", "modules"), scripts(), ids=[name for name, _, _ in scripts()]
+    "page", [pytest.param(page, id=page.name) for page in PAGES if scripts(page)]
 )
-def test_python_of_a_page_runs(name, script, modules, tmp_path, demonstrations):
-    for long, short in SHORTER.items():
-        script = script.replace(long, short)
+def test_python_of_a_page_runs(page, tmp_path):
+    """Its scripts, one after the other in one process."""
+    modules = "".join(block for block in blocks(page, "python") if block.startswith('"""'))
     (tmp_path / "my_tasks.py").write_text(modules)
     for path in TEMPLATES.glob("my_*.py"):
         shutil.copy(path, tmp_path)
-    if DEMONSTRATIONS in script:
-        (page,) = (page for page in PAGES if page.name == name.split()[0])
-        shutil.copytree(demonstrations(page), tmp_path / DEMONSTRATIONS)
-    run_script(tmp_path, script)
+    names = []
+    for number, script in enumerate(scripts(page)):
+        for long, short in SHORTER.items():
+            script = script.replace(long, short)
+        names.append(f"script_{number}.py")
+        (tmp_path / names[-1]).write_text(script)
+        if DEMONSTRATIONS in script and not (tmp_path / DEMONSTRATIONS).exists():
+            collect(page, tmp_path / DEMONSTRATIONS)
+    run_script(tmp_path, f"import runpy\nfor n in {names}: runpy.run_path(n, run_name='__main__')")
 
 
-@pytest.mark.parametrize(
-    ("page", "line"), command_lines(), ids=[line for _, line in command_lines()]
-)
-def test_command_line_of_a_page_is_valid(page, line, tmp_path, monkeypatch, cached_presets):
+LINES = command_lines()
+
+
+@pytest.mark.parametrize("line", LINES)
+def test_command_line_of_a_page_is_valid(line, tmp_path, monkeypatch, cached_presets):
+    """Apart from the environments and networks of a grid, which a slow test builds."""
+    monkeypatch.setattr("ba_torchrl.training.grid.plan._check_parts", lambda runs: None)
+    monkeypatch.chdir(tmp_path)
+    check_command_line(line)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", [line for line in LINES if line.startswith("ba-torchrl bench")])
+def test_grid_of_a_page_can_be_built(line, tmp_path, monkeypatch, cached_presets):
     monkeypatch.chdir(tmp_path)
     check_command_line(line)
 
@@ -179,7 +180,7 @@ def check_command_line(line: str) -> None:
 def test_links_of_a_page_have_targets(page):
     links = re.findall(r"\]\(([^)\s#]+)(?:#[^)]*)?\)|(?:src|href)=\"([^\"#]+)\"", page.read_text())
     for target in map("".join, links):
-        if not target.startswith(("http:", "https:")):
+        if not target.startswith(("http:", "https:", "generated/")):  # `make docs` checks those
             assert (page.parent / target).exists(), target
 
 

@@ -19,7 +19,7 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import OverrideParseException
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from pydantic import BaseModel
 
 from ba_torchrl.core.config import Part
@@ -83,10 +83,7 @@ def register(arguments: Sequence[str] = ()) -> None:
     store = ConfigStore.instance()
     for group, registry in registries().items():
         for name in registry:
-            node = OmegaConf.create({"name": name, **defaults_of(registry[name])})
-            for field in node:
-                if OmegaConf.is_dict(node[field]):  # open: the model checks its entries
-                    OmegaConf.set_struct(node[field], False)
+            node = _choice(name, registry[name])
             store.store(group=f"{group}/schema", name=name, node=node)
             if registry.plugin_module(name) is not None:
                 *folders, last = name.split("/")
@@ -112,9 +109,19 @@ def register_open(folder: Path) -> None:
     _is_complete[0] = False
 
 
-def _register_settings() -> None:
-    """Make the schemas of environment, experiment and grid known, and the resolvers."""
-    store = ConfigStore.instance()
+@functools.cache
+def _choice(name: str, model: type[BaseModel]) -> DictConfig:
+    """Return the schema of a choice of a group."""
+    node = OmegaConf.create({"name": name, **defaults_of(model)})
+    for field in node:
+        if OmegaConf.is_dict(node[field]):  # open: the model checks its entries
+            OmegaConf.set_struct(node[field], False)
+    return node
+
+
+@functools.cache
+def _settings() -> dict[str, DictConfig]:
+    """Return the schemas of environment, experiment and grid."""
     env = {
         name: value
         for name, value in defaults_of(EnvConfig).items()
@@ -123,17 +130,21 @@ def _register_settings() -> None:
     # open: a task adds parameters of its own, which are checked against the task
     environment = OmegaConf.create({"env": env})
     OmegaConf.set_struct(environment.env, False)
-    store.store(name="environment", node=environment)
     experiment = OmegaConf.create({**defaults_of(ExperimentConfig), "env": env})
     OmegaConf.set_struct(experiment.env, False)
-    store.store(name="experiment", node=experiment)
     shared = {name: value for name, value in experiment.items() if name not in SET_BY_THE_GRID}
     grid = OmegaConf.create(
         {**defaults_of(BenchmarkConfig), **shared, "algorithm": {}, "network": {}}
     )
     for name in ("env", "algorithm", "network", "per_task", "per_algorithm", "per_network"):
         OmegaConf.set_struct(grid[name], False)
-    store.store(name="grid", node=grid)
+    return {"environment": environment, "experiment": experiment, "grid": grid}
+
+
+def _register_settings() -> None:
+    """Make the schemas of environment, experiment and grid known, and the resolvers."""
+    for name, node in _settings().items():
+        ConfigStore.instance().store(name=name, node=node)
     OmegaConf.register_new_resolver(
         "if_equal",
         lambda value, other, then, otherwise: then if value == other else otherwise,

@@ -1,4 +1,4 @@
-"""TorchRL's transforms of images, vectors, rewards, counts and actions, on both controls.
+"""TorchRL's transforms of images, vectors, rewards, counts and actions; slow in open loop.
 
 Those that need torchvision (Crop, CenterCrop, Resize) are left out.
 """
@@ -16,8 +16,10 @@ import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data import CenterCrop, ImageCodecs, RandomViews
+from tests.specs import slow_except
 
 TASKS = {"close_loop/block_reaching": {}, "open_loop/block_stacking": {"num_objects": 2}}
+CASES = slow_except(list(TASKS), ["close_loop/block_reaching"])
 
 OF_IMAGES = {
     "CenterCrop of ours": lambda key: CenterCrop(9, [key], ["centre"]),
@@ -94,13 +96,13 @@ def made(task, **config):
     env.close()
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=CASES)
 def pixel_env(request):
     with made(request.param, obs_size=16, rgb=True) as env:
         yield env
 
 
-@pytest.fixture(scope="module", params=TASKS)
+@pytest.fixture(scope="module", params=CASES)
 def vector_env(request):
     with made(request.param, obs_type="vec") as env:
         yield env

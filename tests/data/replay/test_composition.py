@@ -1,6 +1,7 @@
 """Each sampler, writer and storage of the replay with those of TorchRL."""
 
 import copy
+import itertools
 import pickle
 from functools import partial
 
@@ -29,6 +30,7 @@ from ba_torchrl.data.replay.segment_tree import use_python_segment_trees
 from ba_torchrl.data.replay.storage import FrameStorage
 from ba_torchrl.data.replay.symmetric import SymmetricSampler
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
+from tests.specs import slow_except
 
 use_python_segment_trees()
 
@@ -57,11 +59,13 @@ SAMPLERS = {
 OURS = {"FrameStorage", "ExpertKeepingWriter", "ExpertPrioritizedSampler", "SymmetricSampler"}
 WITHOUT_FILES = {"CompressedListStorage", "LazyStackStorage", "ListStorage"}
 """TorchRL writes no nested tensordict of these into files."""
-ROWS = [
-    pytest.param(*row, id="-".join(row))
-    for row in [(s, w, d) for s in STORAGES for w in WRITERS for d in SAMPLERS]
-    if OURS & {*row}
+ROWS = [row for row in itertools.product(STORAGES, WRITERS, SAMPLERS) if OURS & {*row}]
+PAIRS = [
+    (storage, writer, list(SAMPLERS)[(i + j) % len(SAMPLERS)])
+    for i, storage in enumerate(STORAGES)
+    for j, writer in enumerate(WRITERS)
 ]
+"""Every two parts together once."""
 
 
 def transitions(count, start=0):
@@ -99,8 +103,10 @@ def assert_consistent(batch):
 
 
 @pytest.mark.filterwarnings("ignore:Loading the storage on an uninitialized")
-@pytest.mark.parametrize("kind", [ReplayBuffer, TensorDictReplayBuffer])
-@pytest.mark.parametrize(("storage", "writer", "sampler"), ROWS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(ReplayBuffer, marks=pytest.mark.slow), TensorDictReplayBuffer]
+)
+@pytest.mark.parametrize(("storage", "writer", "sampler"), slow_except(ROWS, PAIRS))
 def test_parts_compose(storage, writer, sampler, kind, tmp_path):
     def make(seed):
         return kind(
