@@ -15,11 +15,12 @@ from ba_torchrl.envs import base
 from ba_torchrl.envs.rendering import ARM_VIEW, scene_viewpoint
 from ba_torchrl.record.video import FrameRecorder
 from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.rgb import FOV_DEG, _render, render_rgb
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.workspace import Workspace
-from tests.specs import slow_except_two_robots
+from tests.specs import slow_except, slow_except_two_robots
 from tests.tasks.episodes import follow_expert
 
 STACKING = "open_loop/block_stacking"
@@ -234,8 +235,13 @@ class Motion:
 FILMED = ["open_loop/house_building_3", "ramp/house_building_2", "bump/house_building_4"]
 
 
-@pytest.mark.parametrize("robot", slow_except_two_robots())
-@pytest.mark.parametrize("task", FILMED)
+@pytest.mark.parametrize(
+    ("task", "robot"),
+    slow_except(
+        [*itertools.product(FILMED, ROBOTS)],
+        [(FILMED[0], "kuka"), (FILMED[1], "ur5_robotiq")],
+    ),
+)
 def test_the_arm_of_a_video_moves_between_poses_and_is_in_every_frame(
     make, monkeypatch, task, robot
 ):

@@ -56,6 +56,15 @@ def test_new_tasks_keep_the_contract_and_experts_solve_them(task):
     assert ("with the noise of a learned policy" in str(report)) is has_noise
 
 
+def test_a_task_whose_episodes_are_equal_fails_the_contract(monkeypatch):
+    def initialize_episode(task, rng):
+        task.stand(task.block, task.settings.workspace.center, 0.0)
+
+    monkeypatch.setattr(BlockReaching, "initialize_episode", initialize_episode)
+    with pytest.raises(AssertionError, match="block_reaching: the seed changes nothing"):
+        testing.check_task("close_loop/block_reaching")
+
+
 def test_an_expert_whose_success_needs_exact_actions_passes_with_a_warning(monkeypatch):
     monkeypatch.setattr("ba_torchrl.testing.tasks.CHECKS", ())
     monkeypatch.setattr(BlockReaching, "goal_distance_m", 0.003)

@@ -14,11 +14,11 @@ def check(task, robots):
     assert not (found := fingerprints.changes(task, entry, robots)), "\n".join(found)
 
 
-@pytest.mark.parametrize(("number", "task"), enumerate(fingerprints.built_in()))
+@pytest.mark.parametrize(("number", "task"), [*enumerate(fingerprints.built_in())])
 def test_a_task_and_its_expert_act_as_recorded_for_their_versions(number, task):
-    """With kuka and one of the other robots in turn."""
+    """With kuka, every fourth task also with one of the other robots in turn."""
     robot, *others = fingerprints.ROBOTS
-    check(task, (robot, others[number % len(others)]))
+    check(task, (robot, *([others[number // 4 % 3]] if number % 4 == 0 else [])))
 
 
 @pytest.mark.slow

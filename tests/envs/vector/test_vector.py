@@ -253,11 +253,9 @@ def test_refuses_impossible_sizes(number):
 @pytest.mark.parametrize(
     ("num_envs", "cores", "kind"),
     [
-        (1, 16, SerialVectorEnv),
         (2, 16, SerialVectorEnv),
         (5, 2, SerialVectorEnv),
         (3, 3, VectorEnv),
-        (5, 16, VectorEnv),
     ],
 )
 def test_processes_start_by_default_where_three_run_at_a_time(monkeypatch, num_envs, cores, kind):
@@ -281,19 +279,6 @@ def test_available_cores_are_those_of_the_process():
     finally:
         os.sched_setaffinity(0, before)
     assert available_cores() == len(before)
-
-
-def test_takes_a_function_per_environment(make_fakes):
-    factories = [partial(FakeEnv, horizon=2), partial(FakeEnv, horizon=3)]
-    env = make_vector(factories, 2, seed=0, workers=FORK)
-    try:
-        rollout = env.rollout(3, break_when_any_done=False)
-        assert rollout["next", "truncated"].squeeze(-1).tolist() == [
-            [False, True, False],
-            [False, False, True],
-        ]
-    finally:
-        env.close()
 
 
 def test_refuses_environments_that_cannot_report_a_fault():

@@ -72,8 +72,6 @@ SIX_DOF = {"action_sequence": "pxyzrrr"}
 @pytest.mark.parametrize(
     ("task", "config", "optimum"),
     [
-        (BIN, {"num_objects": 4, **SIX_DOF}, 8),
-        (BOTTLES, SIX_DOF, 12),
         (BOXES, {"num_objects": 6, **SIX_DOF}, 12),
         # every second layer needs the yaw
         (BOXES, {"num_objects": 6, "random_orientation": False, "action_sequence": "pxy"}, 12),
