@@ -16,7 +16,7 @@ def losses(folder, name):
 
 @pytest.mark.parametrize(
     ("network", "changes"),
-    [("cnn", {}), ("equi", {}), ("asr", OPEN)],
+    [("cnn", {}), pytest.param("equi", {}, marks=pytest.mark.slow), ("asr", OPEN)],
     ids=["close_loop cnn", "close_loop equi", "open_loop asr"],
 )
 def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, network, changes):

@@ -13,6 +13,7 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
 from tests.algorithms.tiny import SIX_DOF
+from tests.tasks.episodes import slow
 
 IMAGES = ["heightmap", "in_hand"]
 TASK = "open_loop/block_stacking"
@@ -54,7 +55,7 @@ def demonstration_error(algorithm, data):
     return float(algorithm.loss(data.clone())["demonstration_error"])
 
 
-@pytest.mark.parametrize("network", ["asr", "fcn", "rot_fcn", "equi_asr", "equi_fcn"])
+@pytest.mark.parametrize("network", ["fcn", "equi_asr", *slow(["asr", "rot_fcn", "equi_fcn"])])
 def test_every_network_learns_the_demonstrations(network, transitions):
     imitation = {"name": "sdqfd", "weight": 10.0}
     algorithm = build(network, optimizer={"learning_rate": 1e-3}, imitation=imitation)
@@ -68,10 +69,10 @@ def test_every_network_learns_the_demonstrations(network, transitions):
 @pytest.mark.parametrize(
     ("network", "demonstrations", "augmentation"),
     [
-        ("asr", "sdqfd", "none"),
         ("asr", "dqfd", "se2"),
-        ("asr", "adet", "none"),
-        ("equi_deictic_asr", "sdqfd", "se2"),
+        pytest.param("asr", "sdqfd", "none", marks=pytest.mark.slow),
+        pytest.param("asr", "adet", "none", marks=pytest.mark.slow),
+        pytest.param("equi_deictic_asr", "sdqfd", "se2", marks=pytest.mark.slow),
     ],
 )
 def test_networks_of_six_degrees_of_freedom_learn_the_demonstrations(

@@ -57,7 +57,7 @@ def started(*_, **__):
 
 
 @pytest.mark.parametrize("name", WORK)
-@examples(3)
+@examples(2)
 def test_command_lines(name, count, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     module = load_recipe(name)

@@ -10,6 +10,7 @@ pytest.importorskip("escnn")
 
 from ba_torchrl.core.errors import ConfigError
 from tests.modules.networks import actor_critic
+from tests.tasks.episodes import slow
 
 
 def turn_action(action, sequence, quarters):
@@ -49,7 +50,7 @@ def steps(networks, size, action_size, n=3):
     assert any(not torch.equal(p, q) for p, q in zip(parameters, before, strict=True))
 
 
-@pytest.mark.parametrize("trained", [pytest.param(False, marks=pytest.mark.slow), True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @pytest.mark.parametrize(
     ("size", "sequence", "group_order", "options"),
     [
@@ -107,7 +108,7 @@ def test_the_cyclic_group_is_not_equivariant_to_reflections():
     assert not torch.allclose(reflected, reflect_action(loc, "pxyzr"), rtol=1e-2)
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @torch.no_grad()
 def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(trained):
     networks = actor_critic("equi", group_order=8, precision="bfloat16")

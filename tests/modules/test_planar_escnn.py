@@ -25,7 +25,7 @@ else:
 """
 
 
-@pytest.mark.parametrize("before", ["", "import escnn"])
+@pytest.mark.parametrize("before", ["", pytest.param("import escnn", marks=pytest.mark.slow)])
 def test_planar_groups_work_and_rotations_in_space_name_what_they_need(before, tmp_path):
     run_script(tmp_path, CODE.replace("BEFORE", before))
 

@@ -7,6 +7,7 @@ pytest.importorskip("escnn")
 
 from tests.modules.networks import pose, train, turned_pixels, values_of
 from tests.modules.networks import pose_batch as batch
+from tests.tasks.episodes import slow
 
 SIZE = 64
 
@@ -41,7 +42,7 @@ def assert_different(actual, expected):
     assert (actual - expected).std() > 0.03 * spread(expected)
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(quarters, trained):
     network = build(trained=trained)
@@ -59,7 +60,7 @@ def test_rotating_the_scene_turns_pixels_shifts_yaws_and_keeps_the_other_values(
             assert_different(actual, expected)
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 def test_values_of_a_flattened_scene_are_invariant_for_fixed_features_only(trained):
     network = build(scene_head="flatten", trained=trained)
     *observation, chosen = batch()
@@ -91,7 +92,7 @@ def wrapped(observation, chosen):
     return (heightmap, in_hand, holding), chosen, is_swapped
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @pytest.mark.parametrize("quarters", [1, 2])
 def test_yaws_of_half_a_turn(quarters, trained):
     """A yaw that leaves half a turn swaps the fingers: tilts and what is held turn over."""

@@ -15,7 +15,7 @@ from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
 from tests.modules.networks import COUNTS, POSE, count
 from tests.modules.networks import pose as build
 from tests.modules.networks import pose_batch as batch
-from tests.specs import spatial_spec
+from tests.specs import slow_except, spatial_spec
 
 BOTH = ["asr", "equi_deictic_asr"]
 SIZE = 64
@@ -63,7 +63,9 @@ def test_parameter_counts_of_the_equivariant_heads(
 
 
 @pytest.mark.parametrize("half", [True, False])
-@pytest.mark.parametrize(("size", "in_hand_size"), [(32, 24), (64, 40), (128, 24)])
+@pytest.mark.parametrize(
+    ("size", "in_hand_size"), slow_except([(32, 24), (64, 40), (128, 24)], [(32, 24), (64, 40)])
+)
 @pytest.mark.parametrize("name", BOTH)
 def test_shapes(name, size, in_hand_size, half):
     network = build(name, size, in_hand_size, half)

@@ -6,6 +6,7 @@ import torch
 pytest.importorskip("escnn")
 
 from tests.modules.networks import XY, XYR, batch, spatial, train, turned_pixels
+from tests.tasks.episodes import slow
 
 SIZE = 32
 
@@ -54,7 +55,7 @@ def under_a_quarter_turn(network, shift):
     return levels
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @pytest.mark.parametrize(("name", "components", "half", "fields"), CASES)
 def test_a_quarter_turn_turns_pixels_and_shifts_yaws(name, components, half, fields, trained):
     network = build(name, components, half, **fields, trained=trained)
@@ -71,7 +72,7 @@ def test_a_quarter_turn_turns_pixels_and_shifts_yaws(name, components, half, fie
         assert wrong.std() > 0.1 * (expected - mean).std()
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 def test_yaws_of_a_flattened_scene_are_equivariant_for_fixed_features_only(trained):
     network = build("equi_asr", num_rotations=6, scene_head="flatten", trained=trained)
     heightmap, in_hand, holding, chosen = batch()
@@ -85,7 +86,7 @@ def test_yaws_of_a_flattened_scene_are_equivariant_for_fixed_features_only(train
     assert difference.std() > 0.01 * expected.std()  # a hundred times the tolerance
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @pytest.mark.parametrize(("name", "components", "half", "fields"), CASES)
 def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(
     name, components, half, fields, trained
@@ -99,7 +100,7 @@ def test_quarter_turns_in_bfloat16_are_exact_up_to_its_rounding(
         assert (turned - expected).std() < 0.02 * expected.std()
 
 
-@pytest.mark.parametrize("trained", [False, True])
+@pytest.mark.parametrize("trained", [*slow([False]), True])
 @pytest.mark.parametrize("name", ["equi_fcn", "equi_asr"])
 def test_flips_of_the_image_flip_the_pixels_values(name, trained):
     network = build(name, XY if name == "equi_fcn" else XYR, trained=trained)
