@@ -5,7 +5,8 @@ import pytest
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS as REGISTRY
 from ba_torchrl.testing import tasks as checks
-from tests.tasks.episodes import slow, slow_variants
+from tests.specs import slow_except
+from tests.tasks.episodes import slow_variants
 from tests.tasks.packing.scenes import BIN
 
 TASKS = [task for task in REGISTRY if REGISTRY.plugin_module(task) is None]
@@ -123,14 +124,25 @@ def check_expert(task, episodes, margin, **config):
     )
 
 
-@pytest.mark.parametrize("check", checks.CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize(
+    "check",
+    [check for check in checks.CHECKS if check is not checks.check_vector_specs],
+    ids=lambda check: check.__name__,
+)
 def test_contract(task, check):
     check(task)
 
 
-@pytest.mark.parametrize("task", [*TASKS[::12], *slow(TASKS[6::12])])
-def test_vector_specs_of_worker_processes(task):
-    checks.check_vector_specs(task, parallel=True)
+@pytest.mark.slow
+@pytest.mark.parametrize("task", TASKS)
+def test_any_actions_over_more_episodes(task):
+    checks.check_any_actions(task, episodes=5)
+
+
+@pytest.mark.parametrize("task", slow_except(TASKS, TASKS[::12]))
+@pytest.mark.parametrize("parallel", [False, True])
+def test_vector_specs(task, parallel):
+    checks.check_vector_specs(task, parallel=parallel)
 
 
 @pytest.mark.parametrize(
