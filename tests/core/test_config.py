@@ -1,5 +1,4 @@
 import json
-import pickle
 
 import pytest
 from omegaconf import OmegaConf
@@ -9,7 +8,6 @@ from ba_torchrl.core.config import TaskParameters, parse
 from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.registry import Registry
-from ba_torchrl.envs.settings import resolve_env
 
 
 def test_unknown_parameter_names_the_nearest_and_all_known():
@@ -129,19 +127,3 @@ def test_registry_refuses_two_entries_of_one_name():
 def test_registry_refuses_what_is_no_name(name):
     with pytest.raises(ConfigError, match="register takes a name such as 'mine/thing'"):
         Registry("thing", "ba_torchrl.tasks.close_loop").register(name)
-
-
-def test_list_tasks_is_sorted_and_complete():
-    tasks = ba_torchrl.list_tasks()
-    assert tasks == sorted(tasks)
-    assert {
-        f"close_loop/block_{verb}" for verb in ("reaching", "picking", "pushing", "pulling")
-    } <= set(tasks)
-
-
-@pytest.mark.parametrize("task", ["open_loop/block_stacking", "close_loop/object_grasping"])
-def test_a_configuration_with_parameters_of_its_task_can_be_pickled(task):
-    config = resolve_env(task, {"seed": 3}).config
-    restored = pickle.loads(pickle.dumps(config))
-    assert restored == config
-    assert type(restored) is type(config)
