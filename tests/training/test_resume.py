@@ -161,11 +161,6 @@ def test_a_run_interrupted_before_its_first_state_starts_again(tmp_path, caplog,
     assert read_result(result.record.parent).resumed_at == []
 
 
-def test_without_a_run_to_resume_a_new_one_starts(tmp_path, caplog):
-    assert run(config_for(tmp_path, resume=True, total_updates=3)).updates == 3
-    assert "resume" not in caplog.text  # every new run of a grid has resume=True
-
-
 def test_a_changed_configuration_is_refused_by_name(interrupted, tmp_path, monkeypatch):
     config = interrupted
     before = (config.folder / "config.json").read_bytes()

@@ -230,28 +230,6 @@ def test_placing_on_an_occupied_position_does_not_penetrate(table):
     assert min(block.position[2], below.position[2]) > B / 2 - 1e-3
 
 
-def test_set_state_restores_the_grasp(table):
-    t = table(2)
-    block, below = t.blocks
-    assert t.pick(*block.position) is block
-    world, robot, hand = t.world.snapshot(), t.robot.get_state(), t.hand.get_state()
-    x, y, _ = below.position
-    ends = []
-    for _ in range(2):
-        t.place(x, y, 1.5 * B)
-        ends.append([b.pose for b in t.blocks])
-        assert not block.is_hidden
-        t.world.restore(world)
-        t.robot.set_state(robot)
-        t.hand.set_state(hand)
-        assert t.hand.held is block
-        assert block.is_hidden
-    assert ends[0][0][0][2] == pytest.approx(1.5 * B, abs=1e-3)
-    np.testing.assert_allclose(
-        [pose[0] for pose in ends[0]], [pose[0] for pose in ends[1]], atol=1e-4
-    )
-
-
 def test_pick_and_place_without_teleport(table):
     t = table(2, teleport=False)
     block, below = t.blocks

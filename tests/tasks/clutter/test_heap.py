@@ -13,7 +13,6 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.meshes import box_mesh, write_obj
 from ba_torchrl.tasks.clutter.base import DROP_Z_M
 from ba_torchrl.tasks.terrain.tray import FLOOR_Z_M
-from ba_torchrl.testing.episodes import image_of
 from tests.tasks.episodes import play
 
 NO_OPS = {
@@ -239,28 +238,6 @@ def test_a_seed_reproduces_the_heap_exactly(make, control):
     assert digest(other) == first
     env.reset(seed=6)
     assert digest(env) != first
-
-
-@both_controls
-def test_a_state_restores_the_heap(make, control):
-    env = make(expert=True)
-    play(env, env.reset())
-    play(env, env.reset(), NO_OPS[control])
-    state = env.reset()
-    kept, present, before = env.get_state(), names(env), digest(env)
-    image, action = image_of(state).clone(), state["expert_action"].clone()
-    assert len(present) == DEFAULT_COUNT[control] - 1
-    for _ in range(4):
-        play(env, env.reset())
-    assert names(env) != present
-    state = env.reset(kept, set_state=True)
-    assert names(env) == present
-    assert digest(env) == before
-    assert torch.equal(image_of(state), image)
-    assert torch.equal(state["expert_action"], action)
-    assert env.scene.task.attempts == 2
-    shown = [body.name for body in env.scene.task.pool.bodies if not body.is_hidden]
-    assert sorted(shown) == sorted(present)
 
 
 @both_controls

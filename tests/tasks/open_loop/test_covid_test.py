@@ -413,30 +413,6 @@ def test_heights_from_the_image_fit_thin_objects(make, monkeypatch, kind):
 # -- states ------------------------------------------------------------------------------------
 
 
-def test_a_state_restores_the_tests_and_the_hidden_swabs(make):
-    env = make(seed=4)
-    follow(env, 3)  # a tube is presented, a swab held
-    task, motion = env.scene.task, env.scene.controller
-    swab, kept = motion.held, env.get_state()
-    assert swab in task.swabs
-    follow(env, 3)
-    assert swab.is_hidden
-    assert task.get_state().used_swabs == (task.swabs.index(swab),)
-    later, there = env.get_state(), task.get_state()
-    env.reset(kept, set_state=True)
-    assert motion.held is swab
-    assert task.get_state().used_swabs == ()
-    assert swab in task.objects
-    for _ in range(2):  # while the swab is held, and from another episode
-        env.reset(later, set_state=True)
-        assert motion.held is not swab
-        assert swab.is_hidden
-        assert swab not in task.objects
-        assert task.get_state() == there
-        env.reset()
-        assert not any(body.is_hidden for body in env.scene.world.bodies)
-
-
 def test_a_failure_is_part_of_the_state(make):
     env = make()
     task = env.scene.task
