@@ -109,8 +109,8 @@ def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], jobs: int)
     left = [seconds[run.task, run.label] for run, state in states if state.state != "done"]
     known = [fmean(each) for each in left if each]
     if known:
-        duration = timedelta(seconds=round(sum(known) / jobs))
-        print(f"about {duration} h for {len(known)} of {len(left)} runs, as finished ones took")
+        duration, runs = timedelta(seconds=round(sum(known) / jobs)), f"{len(known)} of {len(left)}"
+        print(f"about {duration} h for {runs} runs, {jobs} at a time, as finished ones took")
 
 
 COMMAND = Command(
