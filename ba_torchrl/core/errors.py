@@ -9,6 +9,7 @@ import re
 import shlex
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, requires
+from typing import Any, get_args
 
 _LISTED_BY = {"task": "`ba-torchrl tasks` and ba_torchrl.list_tasks() list them"}
 """By kind of name, what is written in place of many names."""
@@ -51,6 +52,13 @@ class UnknownNameError(ConfigError, KeyError):
 
         near = difflib.get_close_matches(name, self.known, n=5)
         return [max(near, key=likeness)] if near else []
+
+
+def check_choice(name: str, value: object, choices: Any) -> None:
+    """Check that an argument is one of the values of a Literal."""
+    if value not in get_args(choices):
+        known = ", ".join(map(repr, get_args(choices)))
+        raise ConfigError(f"{name} is one of {known}, not {value!r}")
 
 
 class SettingsError(ConfigError):

@@ -9,6 +9,8 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded
 
+from ba_torchrl.core.errors import check_choice
+
 Storage = Literal["uint8", "float16", "exact"]
 """Type of an image in the replay: 255 equal steps over its range, half precision, or unchanged."""
 Frame = Literal["scene", "gripper", "camera"]
@@ -44,6 +46,10 @@ class ImageSpec:
     frame: Frame = "scene"
     channel_axes: tuple[str, ...] = ()
     dtype: torch.dtype = torch.float32
+
+    def __post_init__(self) -> None:
+        check_choice("storage", self.storage, Storage)
+        check_choice("frame", self.frame, Frame)
 
     @property
     def shape(self) -> tuple[int, int, int]:

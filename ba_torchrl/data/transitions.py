@@ -9,6 +9,7 @@ import torch
 from tensordict import TensorDict, TensorDictBase
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import check_choice
 
 Imitation = Literal["none", "executed", "expert", "expert_everywhere"]
 """Which action an algorithm imitates, and on which transitions:
@@ -44,6 +45,7 @@ def as_transitions(
     Raises:
         KeyError: an entry is missing.
     """
+    check_choice("imitates", imitates, Imitation)
     flat = tensordict if tensordict.ndim == 1 else tensordict.reshape(-1)  # [0] has no reshape
     state = [*images, keys.HOLDING, *vectors]
     ends = (keys.REWARD, keys.DONE, keys.TERMINATED, keys.TRUNCATED, keys.FAULT)

@@ -16,6 +16,7 @@ from torchrl.objectives.utils import dispatch_value_estimator
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import check_choice
 
 Reduction = Literal["none", "mean", "sum"]
 """How the losses of a batch's samples are combined, as in TorchRL."""
@@ -68,17 +69,13 @@ class TransitionLoss(LossModule):
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
         super().__init__()
-        if weighted_terms not in get_args(WeightedTerms) or weight_norm not in get_args(WeightNorm):
-            raise ValueError(
-                f"weighted_terms is one of {get_args(WeightedTerms)} and weight_norm one of "
-                f"{get_args(WeightNorm)}, got {weighted_terms!r} and {weight_norm!r}"
-            )
+        check_choice("weighted_terms", weighted_terms, WeightedTerms)
+        check_choice("weight_norm", weight_norm, WeightNorm)
         self.weighted_terms: WeightedTerms = weighted_terms
         self.weight_norm: WeightNorm = weight_norm
         self.use_prioritized_weights = use_prioritized_weights
         self.reduction: Reduction = "mean" if reduction is None else reduction
-        if self.reduction not in ("none", "mean", "sum"):
-            raise ValueError(f"reduction must be none, mean or sum, got {reduction!r}")
+        check_choice("reduction", self.reduction, Reduction)
         self._in_keys: list[NestedKey] | None = None
 
     @property

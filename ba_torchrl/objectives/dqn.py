@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torchrl.modules import QValueActor
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
@@ -178,6 +179,7 @@ class LevelDQNLoss(TransitionLoss):
         weight_norm: WeightNorm = "mean",
         use_prioritized_weights: bool | Literal["auto"] = "auto",
     ) -> None:
+        check_choice("demonstrations", demonstrations, Demonstrations)
         super().__init__(
             reduction,
             weighted_terms=weighted_terms,

@@ -15,6 +15,7 @@ from torchrl.objectives import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.distance import ActionDistance, action_distance
 from ba_torchrl.objectives.dqn import LevelValues
 
@@ -68,6 +69,7 @@ class BehaviourCloningLoss(_ImitationLoss):
         distance: ActionDistance = "mse",
         entropy_weight: float = 0.0,
     ) -> None:
+        check_choice("distance", distance, ActionDistance)
         super().__init__()
         self.convert_to_functional(actor_network, "actor_network")
         self.distance: ActionDistance = distance

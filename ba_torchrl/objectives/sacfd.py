@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -18,6 +18,7 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
 from ba_torchrl.objectives.distance import ActionDistance, action_distance
 
@@ -130,11 +131,7 @@ class SACfDLoss(TransitionLoss):
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
-        if demonstration_distance not in get_args(ActionDistance):
-            raise ValueError(
-                f"demonstration_distance is one of {get_args(ActionDistance)}, got "
-                f"{demonstration_distance!r}"
-            )
+        check_choice("demonstration_distance", demonstration_distance, ActionDistance)
         if len(encoder_network.out_keys) != 1:
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"

@@ -19,7 +19,7 @@ import shutil
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any, get_args
+from typing import Any
 
 import torch
 from torchrl.checkpoint import (
@@ -34,7 +34,7 @@ from torchrl.checkpoint import (
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.config import Which
-from ba_torchrl.core.errors import ConfigError, DamagedFilesError
+from ba_torchrl.core.errors import ConfigError, DamagedFilesError, check_choice
 from ba_torchrl.core.files import (
     OLD,
     RENAMED,
@@ -347,8 +347,7 @@ def find_checkpoint(path: str | Path, which: Which = "best") -> Path:
     Raises:
         ConfigError: there is none whose files are whole, or ``which`` is something else.
     """
-    if which not in get_args(Which):
-        raise ConfigError(f"which: {which!r} is none of {', '.join(get_args(Which))}")
+    check_choice("which", which, Which)
     path = Path(path)
     if (path / _CHECKPOINTS).is_dir():
         saved = saved_steps(path / _CHECKPOINTS)

@@ -28,7 +28,7 @@ from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import StrictModel, explain
-from ba_torchrl.core.errors import ConfigError, UnknownNameError
+from ba_torchrl.core.errors import ConfigError, UnknownNameError, check_choice
 from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
@@ -277,6 +277,7 @@ def load_policy(
         ConfigError: there is no such policy, its files are damaged, or it names plugins that are
             neither imported nor installed.
     """
+    check_choice("which", which, Which)
     changes = {**_OF_TRAINING, "device": str(device), **changes}
     if str(source) in TASKS:
         path = shipped_file(str(source))

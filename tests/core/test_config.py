@@ -2,12 +2,16 @@ import json
 
 import pytest
 from omegaconf import OmegaConf
+from tensordict import TensorDict
 
 import ba_torchrl
 from ba_torchrl.core.config import TaskParameters, parse
 from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
+from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
+from ba_torchrl.data import RigidAugmentation, as_transitions, make_replay
+from ba_torchrl.objectives import BehaviourCloningLoss, LevelDQNLoss
 
 
 def test_unknown_parameter_names_the_nearest_and_all_known():
@@ -127,3 +131,24 @@ def test_registry_refuses_two_entries_of_one_name():
 def test_registry_refuses_what_is_no_name(name):
     with pytest.raises(ConfigError, match="register takes a name such as 'mine/thing'"):
         Registry("thing", "ba_torchrl.tasks.close_loop").register(name)
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: ImageSpec(1, 16, 1.0, frame="world"), "frame is one of 'scene', .*, not 'world'"),
+        (lambda: ImageSpec(1, 16, 1.0, storage="int8"), "storage is one of 'uint8', "),
+        (lambda: make_replay("per", 8, 2, codecs={}, seed=0), "kind is one of 'uniform', "),
+        (lambda: RigidAugmentation("c4", None, {}, seed=0), "transforms is one of 'translation'"),
+        (
+            lambda: as_transitions(TensorDict(), [], is_demonstration=True, imitates="all"),
+            "imitates is one of 'none', ",
+        ),
+        (lambda: BehaviourCloningLoss(None, distance="l1"), "distance is one of 'mse', 'kl'"),
+        (lambda: LevelDQNLoss(None, demonstrations="dqn"), "demonstrations is one of 'none', "),
+        (lambda: ba_torchrl.load_policy("x/y", which="last"), "which is one of 'best', 'latest'"),
+    ],
+)
+def test_a_misspelt_choice_is_not_taken_for_another(call, message):
+    with pytest.raises(ConfigError, match=message):
+        call()

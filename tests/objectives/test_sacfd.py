@@ -326,7 +326,7 @@ def test_masked_samples_do_not_count(experts, norm):
         ({"demonstration_distance": "l1"}, r"demonstration_distance.*'mse', 'kl'.*'l1'"),
         ({"weighted_terms": "actor"}, r"weighted_terms .* 'actor'"),
         ({"weight_norm": "median"}, r"weight_norm .* 'median'"),
-        ({"reduction": "max"}, "reduction must be none, mean or sum, got 'max'"),
+        ({"reduction": "max"}, "reduction is one of 'none', 'mean', 'sum', not 'max'"),
     ],
 )
 def test_invalid_arguments_are_refused(settings, message):

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import OpenLoopActions
+from ba_torchrl.core.errors import check_choice
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import (
     SeededTransform,
@@ -120,6 +121,7 @@ class RigidAugmentation(SeededTransform):
         action_key: str = keys.ACTION,
     ) -> None:
         super().__init__([*image_pairs(images), action_key], seed)
+        check_choice("transforms", transforms, RigidTransforms)
         if not 0 <= probability <= 1 or order < 1:
             raise ValueError(
                 f"probability must be in [0, 1] and order positive, got {probability}, {order}"

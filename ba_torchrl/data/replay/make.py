@@ -7,6 +7,7 @@ from typing import Literal
 
 from torchrl.data.replay_buffers.samplers import RandomSampler, Sampler
 
+from ba_torchrl.core.errors import check_choice
 from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 from ba_torchrl.data.replay.codecs import ImageCodec
@@ -45,6 +46,7 @@ def make_replay(
         expert_bonus: added to the priority of demonstrations.
         returns_codes: samples hold the images' codes instead of decoded images.
     """
+    check_choice("kind", kind, ReplayKind)
     sampler: Sampler = RandomSampler()
     if kind == "symmetric":
         sampler = SymmetricSampler(seed)
