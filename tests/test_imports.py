@@ -1,6 +1,7 @@
 """Who may import whom, read off the sources and off what an import pulls in."""
 
 import ast
+import io
 import json
 import re
 import subprocess
@@ -9,6 +10,8 @@ from pathlib import Path
 
 import pytest
 import tomllib
+
+from ba_torchrl import sim
 
 ROOT = Path(__file__).parents[1]
 PACKAGE = "ba_torchrl"
@@ -224,3 +227,11 @@ def test_requirements_fit_the_package():
             left, right = ([int(n) for n in text.split(".")] for text in (pinned, version))
             holds = {"==": left == right, ">=": left >= right, "<": left < right}[operator]
             assert holds, f"{package} is pinned to {pinned}, but pyproject.toml says {bound}"
+
+
+def test_a_closed_output_does_not_keep_pybullet_from_its_import(monkeypatch):
+    closed = io.StringIO()
+    closed.close()
+    monkeypatch.setattr(sys, "stdout", closed)
+    with sim._silent():
+        pass

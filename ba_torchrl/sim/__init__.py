@@ -10,7 +10,8 @@ from collections.abc import Iterator
 def _silent() -> Iterator[None]:
     """Context in which compiled code writes nothing to the standard output and error."""
     for stream in filter(None, (sys.stdout, sys.stderr)):
-        stream.flush()
+        with contextlib.suppress(ValueError):  # a closed one
+            stream.flush()
     try:
         kept = [os.dup(number) for number in (1, 2)]
     except OSError:  # a process without these streams
