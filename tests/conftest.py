@@ -56,6 +56,25 @@ def no_folder_stays_on_the_path():
 
 
 @pytest.fixture
+def figures():
+    """Runs draw their figures."""
+
+
+@pytest.fixture(autouse=True)
+def no_figures(request, monkeypatch):
+    """Other runs leave their figure empty, whose drawing takes as long as ten small updates."""
+    experiment = sys.modules.get("ba_torchrl.training.experiment")
+
+    def plot_curve(config, curve):
+        path = config.folder / "learning_curve.png"
+        path.touch()
+        return path
+
+    if experiment is not None and "figures" not in request.fixturenames:
+        monkeypatch.setattr(experiment, "plot_curve", plot_curve)
+
+
+@pytest.fixture
 def cuda(monkeypatch):
     """The CUDA device; float32 has its full precision."""
     monkeypatch.setattr(torch.backends.cudnn, "allow_tf32", False)

@@ -176,9 +176,12 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
     ("network", "algorithm", "changes", "counted"),
     [
         ("cnn", {"name": "sac"}, {}, "labelled"),
-        ("cnn", {"name": "rlpd"}, {}, "all"),
+        pytest.param("cnn", {"name": "rlpd"}, {}, "all", marks=pytest.mark.slow),
         ("cnn", {"name": "iql", "replay": {"name": "symmetric"}}, {}, "all"),
-        ("asr", {"name": "spatial_q", "imitation": {"name": "none"}}, OPEN, "all"),
+        pytest.param(
+            *("asr", {"name": "spatial_q", "imitation": {"name": "none"}}, OPEN, "all"),
+            marks=pytest.mark.slow,
+        ),
         ("asr", {"name": "spatial_q"}, OPEN, "expert's"),
     ],
     ids=["sac", "rlpd", "iql", "dqn", "sdqfd"],

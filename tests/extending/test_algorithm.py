@@ -33,7 +33,7 @@ RUN = {
 }
 
 
-@pytest.mark.parametrize("pretrain_updates", [0, 40])
+@pytest.mark.parametrize("pretrain_updates", [0, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
     values = {**RUN, "pretrain_updates": pretrain_updates, "run_dir": str(tmp_path / "run")}
     config = ExperimentConfig.parse(values)

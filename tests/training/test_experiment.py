@@ -60,6 +60,7 @@ def tiny(tmp_path, **changes):
     return ExperimentConfig.parse({**TINY, "run_dir": str(tmp_path / "run"), **changes})
 
 
+@pytest.mark.usefixtures("figures")
 def test_a_run_writes_its_files(tmp_path):
     result = Experiment(tiny(tmp_path), progress=False).run()
     folder = tmp_path / "run"
