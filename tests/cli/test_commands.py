@@ -78,7 +78,7 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
         raise AssertionError("work started")
 
     load_recipe(name)  # else modules that are imported later would keep `started`
-    for module in ("envs.gym", "testing.tasks", "training.policy"):
+    for module in ("envs.gym", "testing.tasks", "training.evaluation", "training.policy"):
         importlib.import_module(f"ba_torchrl.{module}")
     monkeypatch.chdir(tmp_path)
     # in this order: each looks up what the next one replaces
