@@ -69,7 +69,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
     """Write images as a video, ``.mp4`` (H.264) or ``.gif``, and return its path.
 
     The frames [H, W, 3] are uint8 of equal size. For ``.mp4``, an odd height or width is padded
-    with a copy of the last row or column.
+    with a copy of the last row or column. Frames of a ``.gif`` last at least 10 ms.
     """
     import imageio_ffmpeg
 
@@ -77,9 +77,11 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
     suffix = path.suffix.lower()
     pictures = list(frames) if suffix == ".gif" else list(map(_even, frames))
     height, width = pictures[0].shape[:2]
+    if suffix == ".gif":
+        fps = min(fps, 100)
     source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps))
     with replaced(path) as scratch:
-        # not by imageio, which does not report the exit code
+        # not by the writer of imageio_ffmpeg, which does not report the exit code
         done = subprocess.run(
             [
                 *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-xerror"),

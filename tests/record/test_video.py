@@ -52,3 +52,9 @@ def test_a_gif_keeps_the_colour_of_an_object_in_a_single_frame(tmp_path):
     video[7][10:30, 10:30] = (220, 90, 20)
     read = imageio.imread(write_video(tmp_path / "episode.gif", video, fps=4), index=7)
     assert np.abs(read[12:28, 12:28, :3].astype(int) - (220, 90, 20)).max() < 20
+
+
+def test_a_gif_of_more_than_100_frames_per_second_has_all_frames(tmp_path):
+    video = [np.full((8, 8, 3), 20 * i, np.uint8) for i in range(6)]
+    path = write_video(tmp_path / "episode.gif", video, fps=240)
+    assert len(imageio.imread(path, index=None)) == 6
