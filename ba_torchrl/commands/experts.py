@@ -24,6 +24,7 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import write_text
+from ba_torchrl.envs.settings import check_env
 from ba_torchrl.record.summary import pipes
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
@@ -68,9 +69,11 @@ class Settings(VectorSettings, EnvSettings):
 
 def main(settings: Settings) -> None:
     """Play the experts' episodes and print their success and length."""
-    tables = []
+    chosen, tables = settings.tasks or list_tasks(), []
+    for task in chosen:
+        check_env(task, settings.env)
     for table, columns in COLUMNS.items():
-        tasks = [task for task in settings.tasks or list_tasks() if _table_of(task) == table]
+        tasks = [task for task in chosen if _table_of(task) == table]
         cells = [(task, robot) for task in tasks for robot in settings.robots]
         rows = []
         for task, robot in tqdm(cells, unit="row", disable=not cells):
@@ -98,7 +101,7 @@ def _cell(task: str, settings: Settings, env: dict[str, Any]) -> str:
     try:
         scores = expert_scores(task, settings.episodes, seed=settings.seed, **workers, **env)
     except ConfigError as error:
-        return f"not possible: {error}"
+        return f"not possible: {' '.join(str(error).split())}"
     if not scores.success_rate:
         return "0.000"
     lengths = f"{scores.mean_length:.1f} steps, median {scores.median_length:g}"

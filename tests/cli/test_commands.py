@@ -50,6 +50,7 @@ REFUSED = [
     ("collect", "plugins=[json.py]", "there is no module 'json.py'. Leave out '.py', run from"),
     ("play", "env.seed=5", "leave it out, and set seed"),
     ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),
+    ("experts", "env.num_envs=3", "unknown parameter 'num_envs'"),
     ("experts", "env.robot=ur5", "env: robot is set by the command; leave it out, and set robots"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
