@@ -45,14 +45,14 @@ def take(task: str, episodes: int = EPISODES) -> str:
 
 
 def is_recorded(task: str) -> bool:
-    """Whether the package has a record of the policy's present file, task and protocol."""
+    """Whether the package has a citable record of the policy's present file, task and protocol."""
     file = record_file(task)
     if not file.exists():
         return False
     record = RunResult.model_validate_json(json_bytes(file))
     digest = sha256(shipped_file(task).read_bytes()).hexdigest()
     found = record.policy_file, record.task_version, record.protocol
-    return found == (digest, TASKS[task].version, PROTOCOL)
+    return record.last.is_citable and found == (digest, TASKS[task].version, PROTOCOL)
 
 
 def record_file(task: str) -> Path:

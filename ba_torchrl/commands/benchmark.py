@@ -109,6 +109,7 @@ def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], jobs: int)
     left = [seconds[run.task, run.label] for run, state in states if state.state != "done"]
     known = [fmean(each) for each in left if each]
     if known:
+        jobs = min(jobs, len(known))
         duration, runs = timedelta(seconds=round(sum(known) / jobs)), f"{len(known)} of {len(left)}"
         print(f"about {duration} h for {runs} runs, {jobs} at a time, as finished ones took")
 

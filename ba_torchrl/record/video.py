@@ -70,11 +70,16 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
 
     The frames [H, W, 3] are uint8 of equal size. For ``.mp4``, an odd height or width is padded
     with a copy of the last row or column. Frames of a ``.gif`` last at least 10 ms.
+
+    Raises:
+        ValueError: the path has another suffix.
     """
     import imageio_ffmpeg
 
     path = Path(path)
     suffix = path.suffix.lower()
+    if suffix not in _OPTIONS:
+        raise ValueError(f"{path}: a video is {' or '.join(_OPTIONS)}")
     pictures = list(frames) if suffix == ".gif" else list(map(_even, frames))
     height, width = pictures[0].shape[:2]
     if suffix == ".gif":

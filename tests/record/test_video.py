@@ -58,3 +58,8 @@ def test_a_gif_of_more_than_100_frames_per_second_has_all_frames(tmp_path):
     video = [np.full((8, 8, 3), 20 * i, np.uint8) for i in range(6)]
     path = write_video(tmp_path / "episode.gif", video, fps=240)
     assert len(imageio.imread(path, index=None)) == 6
+
+
+def test_a_video_of_another_format_is_refused(tmp_path):
+    with pytest.raises(ValueError, match=r"film.avi: a video is .mp4 or .gif"):
+        write_video(tmp_path / "film.avi", [np.zeros((4, 4, 3), np.uint8)], 10)
