@@ -1,5 +1,6 @@
 """The scripts and the notebook of docs/tutorials, and the modules that `ba-torchrl new` writes."""
 
+import re
 from pathlib import Path
 
 import pytest
@@ -23,7 +24,7 @@ def script(name):
 def test_the_script_of_sac_trains_from_images(tmp_path):
     code = script("sac").replace('"images" in sys.argv[1:]', "True")
     out = run_script(tmp_path, code).stdout
-    assert "40 steps, 0.0 minutes of CPU time: success rate " in out
+    assert re.search(r"40 steps, \d\.\d minutes of CPU time: success rate ", out)
     assert "test: success rate " in out
 
 
