@@ -18,7 +18,7 @@ from hydra import compose
 from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import OverrideParseException
+from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from pydantic import BaseModel
 
@@ -213,7 +213,7 @@ def plugins_in(arguments: Iterable[str]) -> list[str]:
     parser = OverridesParser.create()
     for argument in arguments:
         if argument.lstrip("+").startswith("plugins="):
-            with contextlib.suppress(OverrideParseException):  # reported by Hydra itself
+            with contextlib.suppress(HydraException):  # reported by Hydra itself
                 value = parser.parse_override(argument).value()
                 names = value if isinstance(value, list) else [value]
                 found += [str(name) for name in names]
