@@ -7,12 +7,27 @@ from pathlib import Path
 
 import pytest
 
+import ba_torchrl
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.envs.vector.parallel import VectorEnv
 
 # Spawned workers inherit this path and find the modules of the tests there.
 sys.path.insert(0, str(Path(__file__).parent))
+
+
+@pytest.fixture
+def make(request):
+    """Make environments that are closed at the end, with the module's `SETTINGS` or others."""
+    settings, made = getattr(request.module, "SETTINGS", {}), []
+
+    def build(task="close_loop/block_picking", **config):
+        made.append(ba_torchrl.make(task, **{**settings, **config}))
+        return made[-1]
+
+    yield build
+    for env in made:
+        env.close(raise_if_closed=False)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from torchrl.envs import EnvBase, ParallelEnv, check_env_specs
 
 import ba_torchrl
 from ba_torchrl import BulletArmEnv
-from ba_torchrl.core.errors import ConfigError, InvalidActionError, SimulationError
+from ba_torchrl.core.errors import InvalidActionError, SimulationError
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs import faults
 from ba_torchrl.envs.checks import checked_action
@@ -23,11 +23,8 @@ TASK = "close_loop/block_picking"
 
 
 @pytest.fixture
-def env():
-    env = ba_torchrl.make(TASK, obs_size=16, seed=0)
-    yield env
-    if not env.is_closed:
-        env.close()
+def env(make):
+    return make(TASK, obs_size=16, seed=0)
 
 
 @pytest.mark.parametrize("task", [TASK, "open_loop/block_stacking"])
@@ -58,20 +55,6 @@ def test_available_envs_lists_the_tasks_of_plugins_too(env, monkeypatch):
     monkeypatch.setattr(TASKS, "_entries", {**TASKS._entries, "mine/task": TASKS[TASK]})
     assert set(BulletArmEnv.available_envs) - set(ba_torchrl.list_tasks()) == set()
     assert "mine/task" in BulletArmEnv.available_envs
-
-
-@pytest.mark.parametrize(
-    ("task", "config"),
-    [("close_loop/block_pick", {}), (TASK, {"num_object": 2}), (TASK, {"obs_size": "large"})],
-)
-def test_the_class_refuses_what_make_refuses(task, config):
-    messages = []
-    for make in (BulletArmEnv, ba_torchrl.make):
-        with pytest.raises(ConfigError) as error:
-            make(task, **config)
-        messages.append(str(error.value))
-    assert messages[0] == messages[1]
-    assert "Did you mean" in messages[0] or "obs_size" in messages[0]
 
 
 def test_the_class_is_a_constructor_for_processes_of_torchrl():
@@ -210,11 +193,10 @@ def test_a_reset_of_none_changes_nothing(env):
     assert env.rand_step(after)["next", "step_count"] == 2
 
 
-def test_expert_key_only_on_request(env):
+def test_expert_key_only_on_request(make, env):
     assert "expert_action" not in env.reset().keys()  # noqa: SIM118 -- a TensorDict
-    with_expert = ba_torchrl.make(TASK, obs_size=16, seed=0, expert=True)
+    with_expert = make(TASK, obs_size=16, seed=0, expert=True)
     assert with_expert.reset()["expert_action"].shape == (5,)
-    with_expert.close()
 
 
 def test_closing_frees_the_simulator(env):

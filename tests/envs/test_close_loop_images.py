@@ -3,8 +3,6 @@
 import numpy as np
 import pytest
 
-import ba_torchrl
-
 
 def ground_and_block(env, z):
     """Return the depth of the floor and of a block's top with the tool at height z."""
@@ -18,17 +16,16 @@ def ground_and_block(env, z):
     return depth.max(), depth[center, center]
 
 
-def test_a_five_centimetre_block_reads_five_centimetres_at_any_camera_height():
-    env = ba_torchrl.make("close_loop/block_picking")
+def test_a_five_centimetre_block_reads_five_centimetres_at_any_camera_height(make):
+    env = make("close_loop/block_picking")
     for z in (0.08, 0.12, 0.2, 0.25):
         ground, top = ground_and_block(env, z)
         assert ground == pytest.approx(z + 0.12, abs=1e-5)
         assert ground - top == pytest.approx(0.05, abs=1e-4)
-    env.close()
 
 
-def test_the_image_covers_45_centimetres_around_the_tool():
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=90)
+def test_the_image_covers_45_centimetres_around_the_tool(make):
+    env = make("close_loop/block_picking", obs_size=90)
     env.reset(seed=0)
     scene = env.scene
     scene.controller.reset(((0.45, 0.0, 0.2), 0.0))
@@ -38,4 +35,3 @@ def test_the_image_covers_45_centimetres_around_the_tool():
     # 5 mm per pixel; +x is down the rows, +y along the columns
     assert (rows.min(), rows.max()) == (45 + 15, 45 + 24)
     assert (cols.min(), cols.max()) == (45 - 15, 45 - 6)
-    env.close()

@@ -18,8 +18,8 @@ from tests.specs import slow_except
         ["close_loop/block_stacking", "open_loop/covid_test", "bump/box_palletizing"],
     ),
 )
-def test_success_is_the_conjunction_of_the_conditions(task):
-    env = ba_torchrl.make(task, seed=3, obs_size=32, expert=True)
+def test_success_is_the_conjunction_of_the_conditions(make, task):
+    env = make(task, seed=3, obs_size=32, expert=True)
     state = env.reset()
     names = env.conditions.keys()
     assert not all(env.conditions.values())
@@ -41,28 +41,25 @@ def test_success_is_the_conjunction_of_the_conditions(task):
     pybullet.disconnect(physicsClientId=env.scene.world.client)
     assert env.step(state.set(keys.ACTION, env.action_spec.zero()))[keys.NEXT][keys.FAULT]
     assert env.conditions == dict.fromkeys(names, False)
-    env.close()
 
 
-def test_grasping_and_lifting_are_separate_conditions():
-    env = ba_torchrl.make("close_loop/block_picking", seed=0, obs_size=32, expert=True)
+def test_grasping_and_lifting_are_separate_conditions(make):
+    env = make("close_loop/block_picking", seed=0, obs_size=32, expert=True)
     state, seen = env.reset(), []
     while not state[keys.DONE]:
         state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION].clone()))[keys.NEXT]
         seen.append(env.conditions)
     assert {"is_grasped": True, "is_lifted": False} in seen
     assert seen[-1] == {"is_grasped": True, "is_lifted": True}
-    env.close()
 
 
-def test_conditions_are_those_of_a_restored_state():
-    env = ba_torchrl.make("close_loop/block_picking", seed=0, obs_size=32)
+def test_conditions_are_those_of_a_restored_state(make):
+    env = make("close_loop/block_picking", seed=0, obs_size=32)
     env.reset()
     before, state = env.conditions, env.get_state()
     env.step(env.reset().set(keys.ACTION, torch.zeros(5)))
     env.reset(state, set_state=True)
     assert env.conditions == before
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -76,21 +73,20 @@ def test_conditions_are_those_of_a_restored_state():
         ),
     ],
 )
-def test_ill_formed_conditions_are_refused(monkeypatch, conditions, message):
+def test_ill_formed_conditions_are_refused(make, monkeypatch, conditions, message):
     monkeypatch.setattr(BlockPicking, "evaluate", lambda task: conditions)
     with pytest.raises(TypeError, match=rf"BlockPicking.evaluate{message}"):
-        ba_torchrl.make("close_loop/block_picking", obs_size=32)
+        make("close_loop/block_picking", obs_size=32)
 
 
 @pytest.mark.parametrize(
     "kind", [np.bool_, np.array, torch.tensor, lambda value: torch.tensor([value])]
 )
-def test_conditions_are_bools_of_any_library(monkeypatch, kind):
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=16, seed=0)
+def test_conditions_are_bools_of_any_library(make, monkeypatch, kind):
+    env = make("close_loop/block_picking", obs_size=16, seed=0)
     state = env.reset()
     conditions = {"is_near": kind(True), "is_far": kind(False)}
     monkeypatch.setattr(BlockPicking, "evaluate", lambda _: conditions)
     assert not env.step(state.set(keys.ACTION, env.action_spec.zero()))[keys.NEXT][keys.SUCCESS]
     assert env.conditions == {"is_near": True, "is_far": False}
     assert all(type(holds) is bool for holds in env.conditions.values())
-    env.close()

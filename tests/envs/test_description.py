@@ -8,9 +8,9 @@ from ba_torchrl.envs import description
 from ba_torchrl.tasks.base import TASKS, versions_of
 
 
-def test_a_description_holds_what_the_environment_has():
+def test_a_description_holds_what_the_environment_has(make):
     found = ba_torchrl.describe("open_loop/bin_packing")
-    env = ba_torchrl.make("open_loop/bin_packing", seed=0)
+    env = make("open_loop/bin_packing", seed=0)
     env.reset()
     try:
         assert found.conditions == tuple(env.conditions)
@@ -46,14 +46,12 @@ def test_an_unknown_task_is_named():
         ba_torchrl.describe("close_loop/block_pickin")
 
 
-def test_the_text_of_an_environment_names_task_robot_image_and_action():
-    env = ba_torchrl.make("close_loop/block_reaching", robot="panda", obs_size=32)
+def test_the_text_of_an_environment_names_task_robot_image_and_action(make):
+    env = make("close_loop/block_reaching", robot="panda", obs_size=32)
     text = repr(env)
-    env.close()
     assert text == (
         "CloseLoopEnv(close_loop/block_reaching, panda, depth 1 x 32 x 32, action pxyzr)"
     )
-    env = ba_torchrl.make("close_loop/block_reaching", obs_type="vec")
+    env = make("close_loop/block_reaching", obs_type="vec")
     assert "kuka, vec, action" in repr(env)
-    env.close()
     assert ba_torchrl.list_robots() == ["kuka", "panda", "ur5", "ur5_robotiq"]

@@ -7,7 +7,6 @@ import pybullet
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.core.errors import SimulationError
 from ba_torchrl.envs import faults
 from ba_torchrl.sim.world import World
@@ -21,8 +20,9 @@ TASKS = {
 TASK = "close_loop/block_picking"
 
 
-def make(task=TASK, **changes):
-    return ba_torchrl.make(task, **{"seed": 0, **TASKS[task], **changes})
+@pytest.fixture
+def make(make):
+    return lambda task=TASK, **changes: make(task, **{"seed": 0, **TASKS[task], **changes})
 
 
 def action(env):
@@ -91,7 +91,7 @@ def _every_world_is_closed(monkeypatch):
         ("open_loop/bin_packing", throw),
     ],
 )
-def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt(task, fault):
+def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt(make, task, fault):
     env = make(task)
     state = env.reset()
     fault(env)
@@ -109,11 +109,10 @@ def test_a_fault_in_a_step_ends_the_episode_truncated_in_a_world_that_is_rebuilt
     state = env.reset()
     assert not state["fault"]
     assert not step(env, state)["fault"]
-    env.close()
 
 
 @pytest.mark.parametrize("fault", [give_nan, disconnect])
-def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
+def test_the_episodes_after_a_fault_are_those_of_the_seed(make, fault):
     undisturbed, env = make(), make()
     expected = [undisturbed.reset(), undisturbed.reset(), undisturbed.reset()]
     state = env.reset()
@@ -121,14 +120,12 @@ def test_the_episodes_after_a_fault_are_those_of_the_seed(fault):
     step(env, state)
     for other in expected[1:]:
         assert torch.equal(env.reset()["depth"], other["depth"])
-    undisturbed.close()
-    env.close()
 
 
 @pytest.mark.parametrize(
     ("task", "fault"), [(TASK, disconnect), (TASK, remove), ("open_loop/bin_packing", disconnect)]
 )
-def test_a_fault_between_two_episodes_starts_the_reset_again(task, fault):
+def test_a_fault_between_two_episodes_starts_the_reset_again(make, task, fault):
     undisturbed, env = make(task), make(task)
     for each in (undisturbed, env):
         each.reset()
@@ -137,11 +134,9 @@ def test_a_fault_between_two_episodes_starts_the_reset_again(task, fault):
     state = env.reset()
     assert torch.equal(image_of(state), image_of(expected))
     assert not step(env, state)["fault"]
-    undisturbed.close()
-    env.close()
 
 
-def test_a_reset_that_always_fails_is_an_error(monkeypatch):
+def test_a_reset_that_always_fails_is_an_error(make, monkeypatch):
     env = make()
 
     def fail(*_):
@@ -151,7 +146,6 @@ def test_a_reset_that_always_fails_is_an_error(monkeypatch):
     monkeypatch.setattr(env.task_class, "initialize_episode", fail)
     with pytest.raises(SimulationError, match="3 times in a row"):
         env.reset()
-    env.close()
 
 
 @pytest.mark.parametrize(
@@ -170,7 +164,7 @@ def test_a_reset_that_always_fails_is_an_error(monkeypatch):
         ("initialize_episode", AttributeError("no block"), "reset"),
     ],
 )
-def test_an_error_of_a_task_is_raised_as_it_is(monkeypatch, method, error, when):
+def test_an_error_of_a_task_is_raised_as_it_is(make, monkeypatch, method, error, when):
     env = make(expert=True, reward="dense", observations=["instruction"])
     state = env.reset()
 
@@ -189,10 +183,9 @@ def test_an_error_of_a_task_is_raised_as_it_is(monkeypatch, method, error, when)
     ]
     assert env.faults == 0
     assert not step(env, env.reset())["fault"]
-    env.close()
 
 
-def test_any_error_in_a_scene_that_is_not_finite_is_a_fault(monkeypatch):
+def test_any_error_in_a_scene_that_is_not_finite_is_a_fault(make, monkeypatch):
     env = make()
     state = env.reset()
 
@@ -202,19 +195,17 @@ def test_any_error_in_a_scene_that_is_not_finite_is_a_fault(monkeypatch):
 
     monkeypatch.setattr(env, "_act", diverge)
     assert step(env, state)["fault"]
-    env.close()
 
 
-def test_a_task_does_not_see_poses_that_are_not_finite(monkeypatch):
+def test_a_task_does_not_see_poses_that_are_not_finite(make, monkeypatch):
     env = make()
     state = env.reset()
     give_nan(env)
     monkeypatch.setattr(env.task_class, "after_action", lambda _: pytest.fail("it was called"))
     assert step(env, state)["fault"]
-    env.close()
 
 
-def test_an_image_that_is_not_finite_is_a_fault(monkeypatch):
+def test_an_image_that_is_not_finite_is_a_fault(make, monkeypatch):
     env = make()
     state = env.reset()
     height_map = env._images
@@ -230,11 +221,10 @@ def test_an_image_that_is_not_finite_is_a_fault(monkeypatch):
         following = step(env, state)
     assert following["fault"]
     assert torch.isfinite(following["depth"]).all()
-    env.close()
 
 
 @pytest.mark.parametrize("task", ["close_loop/block_picking", "open_loop/bin_packing"])
-def test_an_episode_after_a_fault_continues_in_another_environment(task):
+def test_an_episode_after_a_fault_continues_in_another_environment(make, task):
     first = make(task)
     state = first.reset()
     step(first, state)
@@ -251,5 +241,3 @@ def test_an_episode_after_a_fault_continues_in_another_environment(task):
     following = step(second, second.reset())
     for key, value in expected.items():
         assert torch.equal(following[key], value), key
-    first.close()
-    second.close()

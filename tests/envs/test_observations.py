@@ -23,21 +23,12 @@ from tests.tasks.episodes import follow_expert
 PICKING = "close_loop/block_picking"
 GRASPING = "close_loop/object_grasping"
 CAMERAS = ("wrist_rgb", "segmentation")
-SMALL = {"obs_size": 32, "seed": 0}
+SETTINGS = {"obs_size": 32, "seed": 0}
 
 
 @pytest.fixture
-def make():
-    made = []
-
-    def build(task=PICKING, *names, **settings):
-        env = ba_torchrl.make(task, **{**SMALL, "observations": list(names), **settings})
-        made.append(env)
-        return env
-
-    yield build
-    for env in made:
-        env.close()
+def make(make):
+    return lambda task, *names, **settings: make(task, observations=list(names), **settings)
 
 
 def test_all_observations_together_follow_their_specs(make):
@@ -249,14 +240,16 @@ def test_gymnasium_has_the_instruction_in_info():
         env.close()
 
 
-HEAP = {**SMALL, "observations": ["instruction"], "expert": True, "num_objects": 2}
+HEAP = {**SETTINGS, "observations": ["instruction"], "expert": True, "num_objects": 2}
 
 
 def make_heap(seed):
     return ba_torchrl.make(GRASPING, **{**HEAP, "seed": seed})
 
 
-@pytest.mark.parametrize("kind", ["serial", "parallel", "torchrl"])
+@pytest.mark.parametrize(
+    "kind", [pytest.param("serial", marks=pytest.mark.slow), "parallel", "torchrl"]
+)
 def test_vectors_return_the_instruction_of_each_episode(kind):
     """The heap of an environment has one object less after a success."""
     if kind == "torchrl":

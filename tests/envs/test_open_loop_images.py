@@ -2,14 +2,12 @@
 
 import pytest
 
-import ba_torchrl
-
 
 @pytest.mark.parametrize(("sequence", "count"), [("pxyr", 2), ("pxyzr", 1)])
 def test_a_place_renders_the_heightmap_before_it_only_to_find_its_height(
-    sequence, count, monkeypatch
+    make, sequence, count, monkeypatch
 ):
-    env = ba_torchrl.make(
+    env = make(
         "open_loop/block_stacking", seed=0, expert=True, obs_size=32, action_sequence=sequence
     )
     state = env.reset()
@@ -21,6 +19,5 @@ def test_a_place_renders_the_heightmap_before_it_only_to_find_its_height(
         env.scene.camera, "heightmap", lambda *view: rendered.append(view) or heightmap(*view)
     )
     state = env.step(state.set("action", state["expert_action"]))["next"]
-    env.close()
     assert not state["holding"]
     assert len(rendered) == count

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.core import keys
 
 HORIZONTAL = [0.0, 0.45, 0.0, 0.02, 0.0, 0.0, math.pi / 2]
@@ -15,9 +14,9 @@ VERTICAL = [0.0, 0.45, 0.0, 0.02, 0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("fast_mode", [True, False])
-def test_a_pick_through_the_floor_has_no_effect_and_is_told(fast_mode):
+def test_a_pick_through_the_floor_has_no_effect_and_is_told(make, fast_mode):
     with_tilt = {"action_sequence": "pxyzrrr", "fast_mode": fast_mode}
-    env = ba_torchrl.make("open_loop/block_stacking", seed=0, obs_size=32, **with_tilt)
+    env = make("open_loop/block_stacking", seed=0, obs_size=32, **with_tilt)
     state = env.reset()
     assert env.is_out_of_reach is False
     after = env.step(state.clone().set(keys.ACTION, torch.tensor(HORIZONTAL)))[keys.NEXT]
@@ -30,7 +29,6 @@ def test_a_pick_through_the_floor_has_no_effect_and_is_told(fast_mode):
     assert env.is_out_of_reach
     env.reset()
     assert not env.is_out_of_reach
-    env.close()
 
 
 def test_gymnasium_info_tells_what_is_out_of_reach():
@@ -48,8 +46,8 @@ def test_gymnasium_info_tells_what_is_out_of_reach():
     env.close()
 
 
-def test_a_close_loop_motion_that_leaves_the_reach_is_told():
-    env = ba_torchrl.make("close_loop/block_reaching", seed=0, obs_size=32)
+def test_a_close_loop_motion_that_leaves_the_reach_is_told(make):
+    env = make("close_loop/block_reaching", seed=0, obs_size=32)
     state = env.reset()
     solve = env.scene.robot.inverse_kinematics
     assert not env.is_out_of_reach
@@ -60,4 +58,3 @@ def test_a_close_loop_motion_that_leaves_the_reach_is_told():
     assert env.scene.robot.tool_pose()[0][0] < limit + 1e-3
     env.step(state.clone().set(keys.ACTION, torch.tensor([1.0, -1.0, 0.0, 0.0, 0.0])))
     assert not env.is_out_of_reach
-    env.close()

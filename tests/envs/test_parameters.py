@@ -16,22 +16,10 @@ from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.sim.vision.camera_views import VIEWS
 from ba_torchrl.tasks.base import TASKS
 from tests.specs import slow_except
+from tests.tasks.episodes import play
 
 PICKING = "close_loop/block_picking"
-
-
-@pytest.fixture
-def make():
-    """Make environments that are closed at the end."""
-    made = []
-
-    def make(task=PICKING, **config):
-        made.append(ba_torchrl.make(task, **{"obs_size": 32, "seed": 0, **config}))
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close()
+SETTINGS = {"obs_size": 32, "seed": 0}
 
 
 def act(env, state, **components):
@@ -130,10 +118,7 @@ def test_experts_stay_within_the_half_turn(make, task):
     env = make(task, half_rotation=True, expert=True)
     successes = 0
     for _ in range(10):
-        state = env.reset()
-        while not state["done"]:
-            state = env.step(state.set("action", state["expert_action"]))["next"]
-        successes += bool(state["success"])
+        successes += bool(play(env, env.reset())["success"])
     assert successes >= 9
 
 
@@ -193,10 +178,7 @@ def test_the_step_limit_grows_with_the_number_of_blocks(make):
         resolved = resolve_env("open_loop/block_stacking", {"num_objects": count})
         assert resolved.config.max_steps == limit
     env = make("open_loop/block_stacking", num_objects=7, expert=True)
-    state = env.reset(seed=0)
-    while not state["done"]:
-        state = env.step(state.set("action", state["expert_action"]))["next"]
-    assert state["success"]
+    assert play(env, env.reset(seed=0))["success"]
 
 
 def test_close_loop_tray_raises_the_objects_and_is_visible(make):
@@ -207,14 +189,8 @@ def test_close_loop_tray_raises_the_objects_and_is_visible(make):
     assert not torch.equal(*depths)
     # the walls rise towards the border: less deep than the floor
     assert depths[0][0, 32, 6] < depths[1][0, 32, 6] - 0.02
-    state = env.reset()
-    env.close()
     env = make(close_loop_tray=True, expert=True)
-    for _ in range(3):
-        state = env.reset()
-        while not state["done"]:
-            state = env.step(state.set("action", state["expert_action"]))["next"]
-        assert state["success"]
+    assert all(play(env, env.reset())["success"] for _ in range(3))
 
 
 def test_dpos_and_drot_bound_an_action(make):
@@ -314,9 +290,7 @@ def test_physics_mode_sets_up_the_engine(make, settings, time_step_s, iterations
     engine = pybullet.getPhysicsEngineParameters(physicsClientId=env.scene.world.client)
     assert engine["fixedTimeStep"] == pytest.approx(time_step_s)
     assert engine["numSolverIterations"] == iterations
-    while not state["done"]:
-        state = env.step(state.set("action", state["expert_action"]))["next"]
-    assert state["success"]
+    assert play(env, state)["success"]
 
 
 def test_colours_of_floor_and_workspace_affect_rgb_images_only(make):

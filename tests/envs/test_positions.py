@@ -115,8 +115,8 @@ def test_reading_the_position_changes_nothing():
     assert_equal(*runs)
 
 
-def test_a_position_that_the_actions_do_not_determine_is_refused():
-    env = ba_torchrl.make("close_loop/block_reaching", seed=0, obs_size=16)
+def test_a_position_that_the_actions_do_not_determine_is_refused(make):
+    env = make("close_loop/block_reaching", seed=0, obs_size=16)
     env.reset()
     env.rand_step()
     state = env.get_state()
@@ -136,23 +136,17 @@ def test_a_position_that_the_actions_do_not_determine_is_refused():
         )
         assert_equal(env.reset(), other.reset())
         other.close()
-    env.close()
 
 
-def test_an_environment_that_was_not_reset_has_the_position_of_its_first_episode():
-    first, second = (
-        ba_torchrl.make("close_loop/block_reaching", seed=seed, obs_size=16) for seed in (0, 1)
-    )
+def test_an_environment_that_was_not_reset_has_the_position_of_its_first_episode(make):
+    first, second = (make("close_loop/block_reaching", seed=seed, obs_size=16) for seed in (0, 1))
     second.continue_from(first.get_position())
     assert_equal(second.reset(), first.reset())
-    first.close()
-    second.close()
 
 
-def test_a_seed_takes_precedence_over_a_position():
-    env = ba_torchrl.make("close_loop/block_reaching", seed=0, obs_size=16)
+def test_a_seed_takes_precedence_over_a_position(make):
+    env = make("close_loop/block_reaching", seed=0, obs_size=16)
     expected = env.reset(seed=4)
     env.rand_step()
     env.continue_from(env.get_position())
     assert_equal(env.reset(seed=4), expected)
-    env.close()

@@ -4,7 +4,6 @@ import math
 
 import pytest
 
-import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import TASKS
@@ -12,10 +11,10 @@ from ba_torchrl.tasks.base import TASKS
 PICKING = "close_loop/block_picking"
 
 
-def test_render_needs_a_display(monkeypatch):
+def test_render_needs_a_display(make, monkeypatch):
     monkeypatch.delenv("DISPLAY", raising=False)
     with pytest.raises(ConfigError, match="DISPLAY"):
-        ba_torchrl.make(PICKING, render=True)
+        make(PICKING, render=True)
 
 
 @pytest.mark.parametrize(
@@ -48,31 +47,29 @@ def test_render_needs_a_display(monkeypatch):
         ),
     ],
 )
-def test_parameters_without_a_meaning_are_refused(task, settings, message):
+def test_parameters_without_a_meaning_are_refused(make, task, settings, message):
     with pytest.raises(ConfigError, match=message):
-        ba_torchrl.make(task, **settings)
+        make(task, **settings)
 
 
-def test_a_parameter_of_other_tasks_names_them_and_passes_at_its_default():
+def test_a_parameter_of_other_tasks_names_them_and_passes_at_its_default(make):
     with pytest.raises(ConfigError, match=r"parameter of .*open_loop/block_stacking"):
-        ba_torchrl.make(PICKING, object_type="cylinder")
-    env = ba_torchrl.make(PICKING, object_type="cube", object_set="random", obs_size=16)
+        make(PICKING, object_type="cylinder")
+    env = make(PICKING, object_type="cube", object_set="random", obs_size=16)
     assert not hasattr(env.config, "object_type")
-    env.close()
 
 
-def test_a_task_may_need_components_of_the_action(monkeypatch):
+def test_a_task_may_need_components_of_the_action(make, monkeypatch):
     monkeypatch.setattr(TASKS[PICKING], "required_action_components", frozenset({"rz"}))
     with pytest.raises(ConfigError, match="cannot be solved without the components rz"):
-        ba_torchrl.make(PICKING, action_sequence="pxyz")
-    ba_torchrl.make(PICKING, obs_size=16).close()
+        make(PICKING, action_sequence="pxyz")
+    make(PICKING, obs_size=16).close()
 
 
-def test_a_task_may_have_a_default_action_sequence(monkeypatch):
+def test_a_task_may_have_a_default_action_sequence(make, monkeypatch):
     monkeypatch.setattr(TASKS[PICKING], "default_action_sequence", "pxyz")
-    env = ba_torchrl.make(PICKING, obs_size=16)
+    env = make(PICKING, obs_size=16)
     assert env.action_spec.shape == (4,)
     assert resolve_env(PICKING, {}).config.action_sequence == "pxyz"
     given = {"action_sequence": "pxyzr"}
     assert resolve_env(PICKING, given).config.action_sequence == "pxyzr"
-    env.close()

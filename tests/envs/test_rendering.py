@@ -9,7 +9,6 @@ import pybullet
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.envs import base
 from ba_torchrl.envs.rendering import ARM_VIEW, scene_viewpoint
@@ -24,21 +23,13 @@ from tests.specs import slow_except, slow_except_two_robots
 from tests.tasks.episodes import follow_expert
 
 STACKING = "open_loop/block_stacking"
+SETTINGS = {"seed": 1, "expert": True, "obs_size": 32}
 SLOW = pytest.mark.slow
 
 
 @pytest.fixture
-def make():
-    made = []
-
-    def build(task=STACKING, **settings):
-        env = ba_torchrl.make(task, **{"seed": 1, "expert": True, "obs_size": 32, **settings})
-        made.append(env)
-        return env
-
-    yield build
-    for env in made:
-        env.close()
+def make(make):
+    return lambda task=STACKING, **settings: make(task, **settings)
 
 
 def viewpoint_of(env, aspect=4 / 3):

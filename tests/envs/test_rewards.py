@@ -21,20 +21,7 @@ from tests.specs import slow_except
 REACHING, PICKING = "close_loop/block_reaching", "close_loop/block_picking"
 DENSE = [name for name in TASKS if TASKS[name].progress is not Task.progress]
 SEEDS = range(3)
-
-
-@pytest.fixture
-def make():
-    """Make environments with small observations that are closed at the end."""
-    made = []
-
-    def make(task=PICKING, **config):
-        made.append(ba_torchrl.make(task, **{"seed": 0, "expert": True, **config}))
-        return made[-1]
-
-    yield make
-    for env in made:
-        env.close()
+SETTINGS = {"seed": 0, "expert": True}
 
 
 def play(env, seed, *, expert):

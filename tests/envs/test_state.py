@@ -14,7 +14,6 @@ from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError, SimulationError
 from ba_torchrl.envs.vector.batching import Vector
 from ba_torchrl.envs.vector.make import make_vector
-from tests.fresh import run_script
 from tests.specs import slow_except
 
 TASKS = slow_except(
@@ -49,9 +48,9 @@ def same(first, second):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_state_and_its_actions_determine_the_steps(task):
+def test_a_state_and_its_actions_determine_the_steps(make, task):
     # enough steps, also where an episode has one
-    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=50)
+    env = make(task, obs_size=32, seed=0, expert=True, max_steps=50)
     generator = torch.Generator().manual_seed(0)
     for grasped_object in (0, 3, 5):  # before, near and after a grasp
         state = env.reset()
@@ -71,7 +70,6 @@ def test_a_state_and_its_actions_determine_the_steps(task):
         second = play(env, env.reset(kept, set_state=True), actions)
         assert same(first, second)
         assert not same(first, away)
-    env.close()
 
 
 def expert_steps(env, state, count):
@@ -98,9 +96,9 @@ def expert_steps(env, state, count):
         pytest.param("close_loop/object_grasping", 4, marks=pytest.mark.slow),
     ],
 )
-def test_states_and_episodes_do_not_depend_on_earlier_motion(task, seed):
+def test_states_and_episodes_do_not_depend_on_earlier_motion(make, task, seed):
     # with the search tree of Bullet, those with many contacts differ
-    env = ba_torchrl.make(task, obs_size=32, seed=seed, expert=True)
+    env = make(task, obs_size=32, seed=seed, expert=True)
 
     def future(state):
         poses = []
@@ -120,12 +118,11 @@ def test_states_and_episodes_do_not_depend_on_earlier_motion(task, seed):
     env.set_seed(seed)
     env.reset()
     assert [body.pose for body in env.scene.world.bodies] == start
-    env.close()
 
 
-def test_an_action_can_be_undone_by_restoring_the_state():
-    tried = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
-    plain = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
+def test_an_action_can_be_undone_by_restoring_the_state(make):
+    tried = make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
+    plain = make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
     a, b = tried.reset(), plain.reset()
     while not a["done"]:
         kept = tried.get_state()
@@ -137,12 +134,10 @@ def test_an_action_can_be_undone_by_restoring_the_state():
         assert (a == b).all()
     assert a["success"]
     assert torch.equal(tried.reset()["depth"], plain.reset()["depth"])  # the next episode, too
-    tried.close()
-    plain.close()
 
 
-def test_a_state_keeps_how_its_episode_ended():
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, max_steps=1)
+def test_a_state_keeps_how_its_episode_ended(make):
+    env = make("close_loop/block_picking", obs_size=32, seed=0, max_steps=1)
     last = env.step(env.reset().set("action", torch.zeros(5)))["next"]
     kept = env.get_state()
     env.reset()
@@ -151,13 +146,10 @@ def test_a_state_keeps_how_its_episode_ended():
     assert returned["truncated"]
     assert returned["done"]
     assert returned["step_count"] == 1
-    env.close()
 
 
-def test_another_environment_and_a_new_world_continue_a_state():
-    first, second = (
-        ba_torchrl.make("close_loop/object_grasping", obs_size=32, seed=seed) for seed in (0, 1)
-    )
+def test_another_environment_and_a_new_world_continue_a_state(make):
+    first, second = (make("close_loop/object_grasping", obs_size=32, seed=seed) for seed in (0, 1))
     first.step(first.reset().set("action", torch.full((5,), -0.5)))
     kept, actions = first.get_state(), torch.tensor([[1.0, 0.5, 0.0, -1.0, 0.3]] * 4)
     there = pickle.loads(pickle.dumps(kept))
@@ -168,13 +160,11 @@ def test_another_environment_and_a_new_world_continue_a_state():
     pybullet.disconnect(physicsClientId=first.scene.world.client)
     assert first.step(state)["next", "fault"]
     assert same(play(first, first.reset(kept, set_state=True), actions), expected)
-    first.close()
-    second.close()
 
 
-def test_a_reset_to_no_state_of_these_parameters_is_refused():
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32)
-    other = ba_torchrl.make("close_loop/block_picking", obs_size=16)
+def test_a_reset_to_no_state_of_these_parameters_is_refused(make):
+    env = make("close_loop/block_picking", obs_size=32)
+    other = make("close_loop/block_picking", obs_size=16)
     with pytest.raises(SimulationError, match="reset"):
         env.get_state()
     state = env.reset()
@@ -191,8 +181,6 @@ def test_a_reset_to_no_state_of_these_parameters_is_refused():
     first = env.step(kept.clone().set("action", torch.full((5,), -0.5)))["next", "depth"]
     assert not torch.equal(env.reset(kept)["depth"], first)  # a new episode
     assert env._episode == 2
-    env.close()
-    other.close()
 
 
 STEP = torch.tensor([[1.0, 0.3, 0.0, -1.0, 0.0], [-1.0, 0.0, 0.0, -0.5, 0.5]])
@@ -267,17 +255,16 @@ def test_a_state_is_a_keyword_where_torchrl_passes_no_entry(make_vector):
         env.close()
 
 
-def test_deleted_states_free_their_memory():
+def test_deleted_states_free_their_memory(make):
     import pybullet
 
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
+    env = make("close_loop/block_picking", obs_size=32, seed=0)
     env.reset()
     kept = env.get_state()
     number, client = kept["state"].scene.world.id, env.scene.world.client
     del kept
     with pytest.raises(pybullet.error):
         pybullet.restoreState(number, physicsClientId=client)
-    env.close()
 
 
 # -- copies ----------------------------------------------------------------------------------
@@ -309,20 +296,19 @@ def assert_independent_and_equal(env, other, state, steps):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_a_copy_is_an_independent_environment_in_the_same_state(task):
-    env = ba_torchrl.make(task, obs_size=32, seed=0, expert=True, max_steps=50)
+def test_a_copy_is_an_independent_environment_in_the_same_state(make, task):
+    env = make(task, obs_size=32, seed=0, expert=True, max_steps=50)
     for before, make_copy in zip((2, 3, 5), COPIES.values(), strict=True):
         state = expert_steps(env, env.reset(), before)
         other = make_copy(env)
         assert other.scene.world.client != env.scene.world.client
         assert_independent_and_equal(env, other, state, 8)
         other.close()
-    env.close()
 
 
 @pytest.mark.parametrize("name", COPIES)
-def test_copies_without_a_scene_play_the_same_episodes(name):
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32)  # with a random seed
+def test_copies_without_a_scene_play_the_same_episodes(make, name):
+    env = make("close_loop/block_picking", obs_size=32)  # with a random seed
     other = COPIES[name](env)
     assert torch.equal(env.reset()["depth"], other.reset()["depth"])
     env.step(env.reset().set("action", torch.zeros(5)))
@@ -333,23 +319,21 @@ def test_copies_without_a_scene_play_the_same_episodes(name):
     for copied in (last, other):
         assert torch.equal(copied.reset()["depth"], first)
         copied.close()
-    env.close()
 
 
-def test_a_copy_after_a_fault_plays_the_next_episode():
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0)
+def test_a_copy_after_a_fault_plays_the_next_episode(make):
+    env = make("close_loop/block_picking", obs_size=32, seed=0)
     state = env.reset()
     pybullet.disconnect(physicsClientId=env.scene.world.client)
     assert env.step(state.set("action", torch.zeros(5)))["next", "fault"]
     other = copy.deepcopy(env)
     assert torch.equal(other.reset()["depth"], env.reset()["depth"])
-    env.close()
     other.close()
 
 
-def test_a_copy_has_the_parameters_of_the_original():
+def test_a_copy_has_the_parameters_of_the_original(make):
     config = {"obs_size": 32, "robot": "panda", "object_set": "random", "num_objects": 3}
-    env = ba_torchrl.make("close_loop/object_grasping", seed=3, **config)
+    env = make("close_loop/object_grasping", seed=3, **config)
     env.reset()
     other = copy.deepcopy(env)
     assert other.config == env.config
@@ -357,25 +341,7 @@ def test_a_copy_has_the_parameters_of_the_original():
     assert not other.run_type_checks
     env.run_type_checks = True
     assert copy.copy(env).run_type_checks
-    env.close()
     other.close()
-
-
-def test_another_process_continues_a_pickled_environment(tmp_path):
-    env = ba_torchrl.make("close_loop/block_picking", obs_size=32, seed=0, expert=True)
-    state = expert_steps(env, env.reset(), 4)
-    (tmp_path / "env.pickle").write_bytes(pickle.dumps((env, state)))
-    code = (
-        "import pathlib, pickle\n"
-        "env, state = pickle.loads(pathlib.Path('env.pickle').read_bytes())\n"
-        "following = env.step(state.set('action', state['expert_action']))['next']\n"
-        "pathlib.Path('next.pickle').write_bytes(pickle.dumps(following))"
-    )
-    run_script(tmp_path, code)
-    there = pickle.loads((tmp_path / "next.pickle").read_bytes())
-    here = env.step(state.set("action", state["expert_action"]))["next"]
-    assert (here == there).all()
-    env.close()
 
 
 @pytest.mark.parametrize("name", COPIES)
