@@ -3,12 +3,11 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.data.replay.codecs import make_codecs
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
+from tests.tasks import episodes as played
 
 TASK = "close_loop/block_reaching"
 DEPTH_M = 0.39
@@ -21,9 +20,7 @@ def build(network="cnn", **config):
 
 @pytest.fixture(scope="module")
 def demonstrations():
-    env = ba_torchrl.make_vector_env(TASK, 2, parallel=False, expert=True, obs_size=64, seed=0)
-    episodes = collect_demonstrations(env, 6, seed=0)
-    env.close()
+    episodes = played.demonstrations(TASK, 6, num_envs=2, env={"obs_size": 64})
     return torch.cat(
         [
             as_transitions(each, ["depth"], is_demonstration=True, imitates="expert")

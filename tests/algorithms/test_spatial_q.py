@@ -8,12 +8,10 @@ import torch
 from tensordict import TensorDict
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-import ba_torchrl
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.algorithms import tiny
 from tests.algorithms.tiny import SIX_DOF
-from tests.tasks.episodes import slow
+from tests.tasks.episodes import demonstrations, slow
 
 IMAGES = ["heightmap", "in_hand"]
 TASK = "open_loop/block_stacking"
@@ -28,12 +26,8 @@ def build(network="asr", sequence=None, *, seed=0, **config):
 
 
 def collect(count, nearest_action=None, **env):
-    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, seed=0, **{**ENV, **env})
-    found = collect_demonstrations(
-        env, count, seed=0, only_successful=True, nearest_action=nearest_action
-    )
-    env.close()
-    return found
+    options = {"only_successful": True, "nearest_action": nearest_action}
+    return demonstrations(TASK, count, env={**ENV, **env}, **options)
 
 
 def to_transitions(episodes):

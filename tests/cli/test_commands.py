@@ -3,7 +3,6 @@
 import errno
 import importlib
 import json
-import math
 import os
 import shutil
 from collections import namedtuple
@@ -19,7 +18,6 @@ from ba_torchrl.cli.types import check_writable_file
 from ba_torchrl.core.config import StrictModel, parse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import complete_only
-from ba_torchrl.training.config import ExperimentConfig
 from tests.recipes import load_recipe, recipe
 
 RUN = {
@@ -29,41 +27,31 @@ RUN = {
 }
 LONG = 300 * "n"
 REFUSED = [
-    (
-        "train",
-        "algorithm.optimizer.learning_rate=1e300",
-        "learning_rate: Input should be less than",
-    ),
     ("train", "run_dir=file", "it is not a folder"),
     ("train", "run_dir=/dev/full/x", "cannot write to "),
     ("benchmark", "only=9999", "only: must be a number from 0 to "),
-    ("benchmark", "seeds=100000000000", "seeds"),
     ("benchmark", "folder=file", "it is not a folder"),
     ("collect", "foo=1", "unknown setting 'foo'. Known: "),
     ("collect", "env.seed=5", "env: seed is set by the command; leave it out, and set seed"),
-    ("collect", "env.expert=false", "leave it out, and set source"),
     ("collect", "source=deconstruction", "deconstruction has no meaning for close_loop/block_pick"),
     ("collect", "path=run", "run exists already"),
     ("collect", "path=held", "writes held; choose another path"),
     ("collect", "task=close_loop/block_pulling", "demos/close_loop_block_pulling exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("collect", "plugins=[json.py]", "there is no module 'json.py'. Leave out '.py', run from"),
-    ("play", "env.seed=5", "leave it out, and set seed"),
     ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),
     ("experts", "env.num_envs=3", "unknown parameter 'num_envs'"),
     ("experts", "env.robot=ur5", "env: robot is set by the command; leave it out, and set robots"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
     ("plot", "runs=[run]", "cannot read the scalars of run"),
-    ("report", "runs=run", "no finished run below run"),
     ("leaderboard", "runs=demos", "no run below demos"),
     ("report", "folder=file/x", "cannot write to "),
-    ("soak", "tasks=[mine/none]", "unknown task 'mine/none'"),
     ("measure", "output=folder.json", "cannot write to "),
 ]
 REQUIRED = {
     "train": ("run_dir=new",),
-    "benchmark": ("folder=new",),
+    "benchmark": ("folder=new", f"tasks=[{RUN['task']}]", "algorithms=[sac]", "networks=[cnn]"),
     "evaluate": ("policy=run",),
     "export": ("policy=run",),
     "plot": ("runs=[run]",),
@@ -135,23 +123,6 @@ def test_types_of_settings(kind, right, wrong, monkeypatch, tmp_path):
     for value in wrong:
         with pytest.raises(ConfigError, match=r"^invalid settings:\n  value"):
             parse(model, {"value": value}, "settings")
-
-
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        (
-            {"pretrain_updates": 30, "total_updates": 20},
-            r"pretrain_updates \(30\) are part of total_updates \(20\)",
-        ),
-        ({"min_replay": 100_001}, "min_replay: 100001 transitions are more than the replay holds"),
-        ({"algorithm": {"name": "sac", "optimizer": {"learning_rate": math.inf}}}, "learning_rate"),
-        ({"device": "meta"}, "device: use device=cpu"),
-    ],
-)
-def test_a_run_that_cannot_work_is_refused(changes, words):
-    with pytest.raises(ConfigError, match=words):
-        ExperimentConfig.parse({**RUN, **changes})
 
 
 def test_too_many_environments_are_refused():

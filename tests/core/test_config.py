@@ -14,12 +14,6 @@ from ba_torchrl.data import RigidAugmentation, as_transitions, make_replay
 from ba_torchrl.objectives import BehaviourCloningLoss, LevelDQNLoss
 
 
-def test_unknown_parameter_names_the_nearest_and_all_known():
-    with pytest.raises(ConfigError, match="Did you mean 'max_steps'") as error:
-        ba_torchrl.make("close_loop/block_picking", max_step=3)
-    assert "random_orientation" in str(error.value)
-
-
 @pytest.mark.parametrize(
     ("values", "message"),
     [
@@ -86,36 +80,31 @@ def test_a_parameter_of_a_task_cannot_repeat_one_of_every_environment():
         env_config_model(Parameters)
 
 
-def test_scale_takes_a_number_or_a_pair():
-    assert parse(EnvConfig, {"object_scale_range": 0.6}, "c").object_scale_range == (0.6, 0.6)
-    assert parse(EnvConfig, {"object_scale_range": [0.6, 0.7]}, "c").object_scale_range == (
-        0.6,
-        0.7,
-    )
+@pytest.mark.parametrize(("given", "pair"), [(0.6, (0.6, 0.6)), ([0.6, 0.7], (0.6, 0.7))])
+def test_scale_takes_a_number_or_a_pair(given, pair):
+    assert parse(EnvConfig, {"object_scale_range": given}, "c").object_scale_range == pair
 
 
-def test_unknown_task_and_robot_list_the_known_ones():
-    with pytest.raises(ConfigError, match="close_loop/block_picking"):
-        ba_torchrl.make("close_loop/block_pickin")
-    with pytest.raises(ConfigError, match=r"Known: .*kuka"):
-        ba_torchrl.make("close_loop/block_picking", robot="baxter")
+PICKING = "close_loop/block_picking"
 
 
-def test_actions_that_do_not_suit_the_task_are_refused():
-    for sequence in ("pxy", "pxyzrr", "xyz", "pxyzq", "ppxyz"):
-        with pytest.raises(ConfigError, match="close-loop"):
-            ba_torchrl.make("close_loop/block_picking", action_sequence=sequence)
-
-
-def test_workspaces_out_of_reach_or_too_small_are_refused():
-    with pytest.raises(ConfigError, match="cannot reach"):
-        ba_torchrl.make(
-            "close_loop/block_picking", workspace=[[0.5, 1.2], [-0.3, 0.3], [0.01, 0.25]]
-        )
-    with pytest.raises(ConfigError, match="enlarge `workspace`"):
-        ba_torchrl.make(
-            "close_loop/block_picking", workspace=[[0.4, 0.5], [-0.05, 0.05], [0.01, 0.25]]
-        )
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"max_step": 3}, "Did you mean 'max_steps'.* random_orientation"),
+        ({"task": "close_loop/block_pickin"}, PICKING),
+        ({"robot": "baxter"}, "Known: .*kuka"),
+        *(
+            ({"action_sequence": sequence}, "close-loop")
+            for sequence in ("pxy", "pxyzrr", "xyz", "pxyzq", "ppxyz")
+        ),
+        ({"workspace": [[0.5, 1.2], [-0.3, 0.3], [0.01, 0.25]]}, "cannot reach"),
+        ({"workspace": [[0.4, 0.5], [-0.05, 0.05], [0.01, 0.25]]}, "enlarge `workspace`"),
+    ],
+)
+def test_settings_that_make_no_environment_are_refused(settings, message):
+    with pytest.raises(ConfigError, match=f"(?s){message}"):
+        ba_torchrl.make(**{"task": PICKING, **settings})
 
 
 def test_registry_refuses_two_entries_of_one_name():

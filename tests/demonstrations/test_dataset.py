@@ -6,14 +6,11 @@ from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.data import SliceSampler, SliceSamplerWithoutReplacement
 from torchrl.data.datasets.common import BaseDatasetExperienceReplay
-from torchrl.envs import RenameTransform
 from torchrl.objectives import BCLoss, IQLLoss
 
-import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.demonstrations import (
     BulletArmExperienceReplay,
-    collect_demonstrations,
     export_demonstrations,
     load_demonstrations,
     save_demonstrations,
@@ -21,6 +18,7 @@ from ba_torchrl.demonstrations import (
 from ba_torchrl.modules import squashed_gaussian_policy
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from tests.modules.networks import actor_critic
+from tests.tasks.episodes import demonstrations
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "observations": ["instruction"]}
 NAME = f"{TASK}/expert"
@@ -30,11 +28,9 @@ NAME = f"{TASK}/expert"
 def root(tmp_path_factory):
     """Return a folder with two sets, one of which has episodes of several lengths."""
     root = tmp_path_factory.mktemp("graded")
-    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, expert=True, **ENV)
     for name, noise in ((NAME, 0.6), ("other", 0.0)):
-        episodes = collect_demonstrations(env, 3, seed=0, noise=noise)
+        episodes = demonstrations(TASK, 3, env=ENV, noise=noise)
         save_demonstrations(root / name, episodes, task=TASK, env=ENV, seed=0)
-    env.close()
     (root / ".other.scratch" / "other").mkdir(parents=True)
     (root / ".other.scratch" / "other" / "demonstrations.json").write_text("{}")
     return root
@@ -102,12 +98,6 @@ def test_slices_are_those_of_episodes(root, episodes, sampler):
         assert torch.equal(part["step_count"][:count], episodes[number]["step_count"])
         assert part["next", "done"][count - 1]
     assert found == len(batch)
-
-
-def test_a_transform_of_samples(root):
-    transform = RenameTransform(["depth"], ["pixels"])
-    replay = BulletArmExperienceReplay(NAME, 4, root=root, transform=transform)
-    assert replay.sample()["pixels"].shape == (4, 1, 64, 64)
 
 
 @pytest.mark.parametrize("kind", [BCLoss, IQLLoss])

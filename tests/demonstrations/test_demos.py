@@ -15,6 +15,7 @@ from ba_torchrl.demonstrations.collect import (
 )
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.tasks.base import TASKS
+from tests.tasks.episodes import demonstrations
 
 TASK = "open_loop/block_stacking"
 ENV = {"obs_size": 32, "num_objects": 2}
@@ -156,19 +157,15 @@ def test_a_folder_that_is_not_complete_is_removed(collected, tmp_path, monkeypat
 
 
 NOISY_TASK = "close_loop/block_reaching"
+NOISY = {"num_envs": 2, "env": {"obs_size": 32}}
 
 
 @pytest.fixture(scope="module")
 def noisy():
     """Episodes with random actions: what was returned, and the steps with the expert's actions."""
-    env = ba_torchrl.make_vector_env(
-        NOISY_TASK, 2, parallel=False, seed=0, obs_size=32, expert=True
-    )
     played = []
-    episodes = collect_demonstrations(env, 30, seed=0, noise=0.3, on_episode=played.append)
-    again = collect_demonstrations(env, 30, seed=0, noise=0.3)
-    env.close()
-    return episodes, played, again
+    episodes = demonstrations(NOISY_TASK, 30, **NOISY, noise=0.3, on_episode=played.append)
+    return episodes, played, demonstrations(NOISY_TASK, 30, **NOISY, noise=0.3)
 
 
 def test_random_actions_of_a_demonstration_are_flagged(noisy):
@@ -227,11 +224,8 @@ def test_without_labels_only_the_steps_of_the_expert_are_imitated(noisy):
 
 
 def test_labels_of_demonstrations_are_actions_that_the_policy_can_choose():
-    env = ba_torchrl.make_vector_env(
-        NOISY_TASK, 2, parallel=False, seed=0, obs_size=32, expert=True
-    )
-    episodes = collect_demonstrations(env, 2, seed=0, noise=0.3, nearest_action=torch.round)
-    env.close()
+    options = {**NOISY, "noise": 0.3, "nearest_action": torch.round}
+    episodes = demonstrations(NOISY_TASK, 2, **options)
     steps = torch.cat(episodes)
     for key in (keys.ACTION, keys.EXPERT_ACTION):
         assert torch.equal(steps[key], steps[key].round())
@@ -240,20 +234,9 @@ def test_labels_of_demonstrations_are_actions_that_the_policy_can_choose():
 
 @pytest.mark.parametrize("noise", [0.0, 0.2])
 def test_random_turns_leave_the_other_components(noise):
-    env = ba_torchrl.make_vector_env(
-        NOISY_TASK, 2, parallel=False, seed=0, obs_size=32, expert=True
-    )
     played = []
-    collect_demonstrations(
-        env,
-        40,
-        seed=0,
-        noise=noise,
-        turn_noise=0.5,
-        turns=[4],
-        on_episode=played.append,
-    )
-    env.close()
+    options = {**NOISY, "turn_noise": 0.5, "turns": [4], "on_episode": played.append}
+    demonstrations(NOISY_TASK, 40, noise=noise, **options)
     steps = torch.cat(played)
     same = steps[keys.ACTION] == steps[keys.EXPERT_ACTION]
     others, turn = same[:, :4].all(dim=-1), same[:, 4]
@@ -281,18 +264,7 @@ def test_noise_that_cannot_be_added_is_refused(settings, message):
 
 
 def test_random_actions_keep_the_primitive_that_the_gripper_can_execute():
-    env = ba_torchrl.make_vector_env(
-        "open_loop/block_stacking",
-        2,
-        parallel=False,
-        seed=0,
-        obs_size=32,
-        num_objects=2,
-        expert=True,
-    )
-    episodes = collect_demonstrations(env, 10, seed=0, noise=0.4, primitive=0)
-    env.close()
-    steps = torch.cat(episodes)
+    steps = torch.cat(demonstrations(TASK, 10, num_envs=2, env=ENV, noise=0.4, primitive=0))
     is_random = ~steps[keys.IS_EXPERT].squeeze(-1)
     assert is_random.sum() > 10
     holding = steps[keys.HOLDING].to(steps[keys.ACTION].dtype)

@@ -15,7 +15,6 @@ import pytest
 import torch
 import zarr
 from tensordict import NonTensorStack, TensorDict
-from torchrl.data.datasets import MinariExperienceReplay
 
 import ba_torchrl
 from ba_torchrl.core.errors import (
@@ -25,17 +24,16 @@ from ba_torchrl.core.errors import (
     UnknownNameError,
 )
 from ba_torchrl.demonstrations import (
-    collect_demonstrations,
     export_demonstrations,
     load_demonstrations,
     save_demonstrations,
 )
-from ba_torchrl.demonstrations.collect import source_config
 from ba_torchrl.demonstrations.demo_files import check_demonstrations, read_demonstrations
 from ba_torchrl.demonstrations.formats import base
 from ba_torchrl.demonstrations.formats.base import FORMATS, Format, read_card
 from ba_torchrl.demonstrations.mapping import with_results
 from ba_torchrl.envs.settings import resolve_env
+from tests.tasks.episodes import demonstrations
 from tests.training.test_limits import limited
 
 TASK, ENV, SIZE = "close_loop/block_picking", {"obs_size": 64}, 64
@@ -93,11 +91,7 @@ def episodes():
 
 @pytest.fixture(scope="module")
 def collected():
-    env = ba_torchrl.make_vector_env(
-        TASK, 1, parallel=False, seed=0, **ENV, **source_config("expert")
-    )
-    yield collect_demonstrations(env, 2, seed=0, noise=0.2)
-    env.close()
+    return demonstrations(TASK, 2, env=ENV, noise=0.2)
 
 
 def exported(path, episodes, name, **changes):
@@ -124,23 +118,16 @@ def test_every_value_comes_back(name, episodes, tmp_path):
     if name == "lerobot":
         pytest.importorskip("lerobot")
     path = exported(tmp_path, episodes, name, policy="a hand")
-    card = base.card_file(path)
-    card.write_text(card.read_text(), encoding="utf-8-sig")  # by an editor
     assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
     card = read_card(path)
     assert (card.policy, card.mean_return) == ("a hand", card.success_rate)
     assert (card.task, card.robot, card.seed, card.source) == (TASK, "kuka", 7, "expert")
     assert (card.episodes, card.steps, card.success_rate) == (3, 9, pytest.approx(2 / 3))
     assert card.instructions == [f"pick up block {i}" for i in range(3)]
-    page = (
-        path / "README.md" if path.is_dir() else path.with_name("picking.hdf5.card.md")
-    ).read_text()
-    assert f"| `{card.entries['proprio'].name}` | observation `proprio` | float32 | [8] |" in page
+    page = path / "README.md" if path.is_dir() else path.with_name("picking.hdf5.card.md")
     image = [1, SIZE, SIZE] if name == "lerobot" else [SIZE, SIZE, 1]
-    assert f"| `{card.entries['depth'].name}` | observation `depth` | float32 | {image} |" in page
-    reward = [] if name == "hdf5" else [1]
-    assert f"| result `reward` | float32 | {reward} |" in page
-    assert ("LeRobot" in page) == (name == "lerobot")
+    row = f"| `{card.entries['depth'].name}` | observation `depth` | float32 | {image} |"
+    assert row in page.read_text()
     assert card.entries["depth"].shape == (1, SIZE, SIZE)
 
 
@@ -212,24 +199,6 @@ def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):
     env.close()
 
 
-def test_torchrl_reads_what_minari_wrote(collected, tmp_path, monkeypatch):
-    pytest.importorskip("minari")
-    exported(tmp_path, collected, "minari")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
-    monkeypatch.setattr(TensorDict, "memmap_like", TensorDict.memmap)  # which 0.14.1 must call
-    data = MinariExperienceReplay(
-        PATHS["minari"], batch_size=4, root=tmp_path / "torchrl", load_from_local_minari=True
-    )[:]
-    steps = torch.cat(collected)
-    ours = [("depth",), ("holding",), ("next", "depth"), ("next", "holding")]
-    theirs = [(*key[:-1], "observation", key[-1]) for key in ours]
-    same = [("action",), ("next", "reward"), ("next", "terminated"), ("next", "truncated")]
-    for key, name in zip([*ours, *same], [*theirs, *same], strict=True):
-        assert torch.equal(data[name], steps[key]), key
-    lengths = torch.tensor([len(each) for each in collected])
-    assert torch.equal(data["episode"], torch.arange(2).repeat_interleave(lengths))
-
-
 def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):
     options = {"format": "minari", "task": TASK, "env": ENV, "seed": 0}
     for name in ("pick ing", "picking", "picking-v"):
@@ -237,19 +206,6 @@ def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_p
             export_demonstrations(tmp_path / name, collected, **options)
     with pytest.raises(ConfigError, match=r"does not observe .*wrist_rgb"):
         export_demonstrations(tmp_path / "a-v0", episodes, **options)
-
-
-def test_minari_has_infos_of_the_reset(collected, tmp_path):
-    minari = pytest.importorskip("minari")
-    path = exported(tmp_path, collected, "minari")
-    for found, ours in zip(
-        minari.MinariDataset(path / "data").iterate_episodes(), collected, strict=True
-    ):
-        steps = len(ours)
-        assert {len(rows) for rows in found.infos.values()} == {steps + 1}
-        np.testing.assert_array_equal(found.infos["success"][1:], ours["next", "success"])
-        assert not found.infos["success"][0]
-        np.testing.assert_array_equal(found.infos["expert_action"][:-1], ours["expert_action"])
 
 
 @pytest.mark.filterwarnings("ignore::UserWarning")  # of what a card of Minari lacks
@@ -794,24 +750,28 @@ def test_rows_that_are_missing_are_named(lost, tmp_path):
         load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
 
 
-def test_files_of_others_need_a_mapping_and_ours_need_none(collected, tmp_path):
-    path = foreign(tmp_path / "a.hdf5")
-    with pytest.raises(ConfigError, match=r"demonstrations_mapping\). It holds actions \[5\], obs"):
-        load_demonstrations(path, task=TASK, env=ENV)
-    save_demonstrations(tmp_path / "ours", collected, task=TASK, env=ENV, seed=0)
-    with pytest.raises(ConfigError, match="has our entries; leave out the mapping"):
-        load_demonstrations(tmp_path / "ours", task=TASK, env=ENV, mapping=FOREIGN)
-    (tmp_path / "b.yaml").write_text("- a\n- b\n")
-    with pytest.raises(ConfigError, match=r"b\.yaml: must map keys to names"):
-        load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "b.yaml")
-    (tmp_path / "d.yaml").write_text("depth: [1,\naction: b\n")
-    with pytest.raises(ConfigError, match=r"d\.yaml: .* line 3"):
-        load_demonstrations(path, task=TASK, env=ENV, mapping=tmp_path / "d.yaml")
-    with pytest.raises(ConfigError, match=r"no demonstrations at .*in the formats"):
-        load_demonstrations(tmp_path / "none.hdf5", task=TASK, env=ENV, mapping=FOREIGN)
-    (tmp_path / "c.hdf5").write_text("no HDF5")
-    with pytest.raises(ConfigError, match=r"c\.hdf5 cannot be read: OSError"):
-        load_demonstrations(tmp_path / "c.hdf5", task=TASK, env=ENV, mapping=FOREIGN)
+@pytest.mark.parametrize(
+    ("name", "mapping", "message"),
+    [
+        ("a.hdf5", None, r"demonstrations_mapping\). It holds actions \[5\], obs"),
+        ("ours", FOREIGN, "has our entries; leave out the mapping"),
+        ("a.hdf5", "b.yaml", r"b\.yaml: must map keys to names"),
+        ("a.hdf5", "d.yaml", r"d\.yaml: .* line 3"),
+        ("none.hdf5", FOREIGN, "no demonstrations at .*in the formats"),
+        ("c.hdf5", FOREIGN, r"c\.hdf5 cannot be read: OSError"),
+    ],
+)
+def test_files_of_others_need_a_mapping_and_ours_need_none(
+    name, mapping, message, collected, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    foreign("a.hdf5")
+    Path("b.yaml").write_text("- a\n- b\n")
+    Path("d.yaml").write_text("depth: [1,\naction: b\n")
+    Path("c.hdf5").write_text("no HDF5")
+    save_demonstrations("ours", collected, task=TASK, env=ENV, seed=0)
+    with pytest.raises(ConfigError, match=message):
+        load_demonstrations(name, task=TASK, env=ENV, mapping=mapping)
 
 
 @pytest.mark.parametrize(

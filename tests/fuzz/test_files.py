@@ -9,10 +9,8 @@ import pytest
 import torch
 from hypothesis import strategies as st
 
-import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import CHECKSUMS_FILE, read_state, seal, write_state
-from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
@@ -20,6 +18,7 @@ from ba_torchrl.training.checkpoint import Checkpoints, load, write_config
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.learner import build_algorithm
 from tests.fuzz.values import JSON, check, examples
+from tests.tasks.episodes import demonstrations
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 4}
 RUN = {
@@ -38,9 +37,7 @@ RUN = {
 @pytest.fixture(scope="module")
 def demos(tmp_path_factory):
     path = tmp_path_factory.mktemp("demos") / "demos"
-    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, seed=0, expert=True, **ENV)
-    episodes = collect_demonstrations(env, 2, seed=0)
-    env.close()
+    episodes = demonstrations(TASK, 2, env=ENV)
     save_demonstrations(path, episodes, task=TASK, env=ENV, seed=0)
     return path
 

@@ -1,7 +1,12 @@
 """The tasks of the tests, and the episodes that they play."""
 
+import contextlib
+
 import pytest
 import torch
+
+import ba_torchrl
+from ba_torchrl.demonstrations.collect import collect_demonstrations
 
 SLOW_VARIANTS = [f"ramp/house_building_{i}" for i in (1, 2, 3, 4)]
 SLOW_VARIANTS += ["ramp/block_stacking", "ramp/improvise_house_building_2"]
@@ -65,3 +70,10 @@ def play_scene(env):
         state = env._step(env.full_action_spec.zero().set("action", action))
         if state["done"]:
             return state
+
+
+def demonstrations(task, count, *, num_envs=1, env=(), **options):
+    """Return demonstrations in environments of this process with given parameters."""
+    settings = {"seed": 0, "parallel": False, "expert": True, **dict(env)}
+    with contextlib.closing(ba_torchrl.make_vector_env(task, num_envs, **settings)) as envs:
+        return collect_demonstrations(envs, count, **{"seed": 0, **options})

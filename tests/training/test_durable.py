@@ -11,10 +11,8 @@ import sys
 import pytest
 import torch
 
-import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import CHECKSUMS_FILE, fingerprint, seal
-from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.results import read_failure
 from ba_torchrl.training.checkpoint import (
@@ -27,7 +25,9 @@ from ba_torchrl.training.checkpoint import (
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from tests.planted import Planted
+from tests.tasks import episodes as episodes_of
 from tests.training.test_interruption import SAC
+from tests.training.test_resume import interrupt
 
 TASK, ENV = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 8}
 TINY = {
@@ -47,10 +47,6 @@ TINY = {
 SIDECARS = ("other.pickle", "pickle.pkl", "prefetch.pkl", "state.pt", "transform.t", "frames.pt")
 
 
-class Interrupted(BaseException):
-    """An exception that no code handles."""
-
-
 def config_for(folder, **changes):
     return ExperimentConfig.parse({**TINY, "run_dir": str(folder), **changes})
 
@@ -59,25 +55,13 @@ def config_for(folder, **changes):
 def interrupted_run(tmp_path_factory):
     """A run folder with the states after 2 and 4 updates."""
     folder = tmp_path_factory.mktemp("interrupted") / "run"
-    experiment = Experiment(config_for(folder), progress=False)
-    update = experiment.algorithm.update
-
-    def stop():
-        if experiment.algorithm.updates == 5:
-            raise Interrupted
-        return update()
-
-    experiment.algorithm.update = stop
-    with pytest.raises(Interrupted):
-        experiment.run()
+    interrupt(config_for(folder), after=5)
     return folder
 
 
 @pytest.fixture(scope="module")
 def demonstrations(tmp_path_factory):
-    env = ba_torchrl.make_vector_env(TASK, 1, parallel=False, seed=0, expert=True, **ENV)
-    episodes = collect_demonstrations(env, 2, seed=0)
-    env.close()
+    episodes = episodes_of.demonstrations(TASK, 2, env=ENV)
     path = tmp_path_factory.mktemp("demos") / "demos"
     save_demonstrations(path, episodes, task=TASK, env=ENV, seed=0)
     return path
@@ -180,11 +164,6 @@ def test_no_module_that_a_run_names_is_imported(run, monkeypatch):
     del sys.modules["planted_module"]
 
 
-def test_a_replay_is_tensors_and_values(run):
-    files = {path.suffix for path in (run / "resume").rglob("*") if path.is_file()}
-    assert files == {".json", ".safetensors"}
-
-
 # -- damage ------------------------------------------------------------------------------------
 
 
@@ -219,6 +198,10 @@ def test_a_run_whose_states_are_all_damaged_says_what_to_do(run):
     with pytest.raises(ConfigError, match="start the run again in another run_dir") as error:
         resume(run)
     assert "\n" not in str(error.value)
+    for checkpoint in (run / "checkpoints").iterdir():
+        cut(checkpoint / "manifest.json")
+    with pytest.raises(ConfigError, match="all checkpoints"):
+        load(run)
 
 
 @pytest.mark.parametrize("which", ["latest", "best"])
@@ -232,13 +215,6 @@ def test_a_damaged_checkpoint_falls_back_to_the_one_before(run, which, damage, c
     assert load(run, which)[1].updates == int(older.name[-1])
     with pytest.raises(ConfigError, match=str(newest)):  # asked for by name
         load(newest)
-
-
-def test_a_run_whose_checkpoints_are_all_damaged_is_refused(run):
-    for checkpoint in (run / "checkpoints").iterdir():
-        cut(checkpoint / "manifest.json")
-    with pytest.raises(ConfigError, match="all checkpoints"):
-        load(run)
 
 
 def test_damaged_demonstrations_are_refused(demonstrations, tmp_path):

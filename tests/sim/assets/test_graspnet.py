@@ -100,19 +100,11 @@ def test_suffixes_and_names_ignore_case(tmp_path):
     np.testing.assert_allclose(extents, [[0.03] * 3, [0.05] * 3])
 
 
-def make_dangling_link(path):
-    path.symlink_to(path.parent / "gone.obj")
-
-
-def make_link_to_itself(path):
-    path.symlink_to(path)
-
-
 @pytest.mark.parametrize(
     ("make", "what"),
     [
-        (make_dangling_link, "a link to nothing"),
-        (make_link_to_itself, "a link to nothing"),
+        (lambda path: path.symlink_to(path.parent / "gone.obj"), "a link to nothing"),
+        (lambda path: path.symlink_to(path), "a link to nothing"),
         (Path.mkdir, "a folder"),
         (os.mkfifo, "no file"),  # reading it would block
     ],
