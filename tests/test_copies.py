@@ -6,7 +6,6 @@ import resource
 from contextlib import ExitStack, closing
 from functools import cache, partial
 from multiprocessing import get_context
-from tempfile import TemporaryDirectory
 from typing import get_args
 
 import gymnasium
@@ -20,13 +19,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 import ba_torchrl
 from ba_torchrl.data import SymmetricSampler
 from ba_torchrl.data.replay.make import ReplayKind
-from ba_torchrl.demonstrations import (
-    collect_demonstrations,
-    load_demonstrations,
-    save_demonstrations,
-)
-from ba_torchrl.demonstrations.collect import RandomActions, source_config
-from ba_torchrl.training.policy import read_card, shipped_file
+from ba_torchrl.demonstrations.collect import RandomActions
 from tests.algorithms.tiny import build, transitions
 from tests.specs import slow_except
 
@@ -107,16 +100,6 @@ def noise():
         return RandomActions(env, 0.5, seed=0)
 
 
-def loaded_demonstrations():
-    options = {**SMALL, "max_steps": 3, "parallel": False, **source_config("expert")}
-    with closing(ba_torchrl.make_vector_env(PICKING, 1, **options)) as envs:
-        episodes = collect_demonstrations(envs, 1, seed=0)
-    with TemporaryDirectory() as folder:
-        env = {"obs_size": 32, "max_steps": 3}
-        save_demonstrations(f"{folder}/demos", episodes, task=PICKING, env=env, seed=0)
-        return [episode.to_dict() for episode in load_demonstrations(f"{folder}/demos")]
-
-
 POLICIES = {
     "CNN": "close_loop/corner_picking",
     "Equi": PICKING,
@@ -158,16 +141,7 @@ RETURNED = {
     "environment, open loop": (partial(started, STACKING, rgb=True), step),
     "vector in this process": (partial(vector, parallel=False), step),
     "Gymnasium's environment": (gymnasium_env, step_gymnasium),
-    "EnvConfig": (partial(ba_torchrl.EnvConfig, obs_size=64), itself),
-    "parameters of a task": (
-        lambda: ba_torchrl.resolve_env("close_loop/object_grasping", {}).config,
-        itself,
-    ),
     "ResolvedEnv": (partial(ba_torchrl.resolve_env, STACKING, {"num_objects": 2}), itself),
-    "WorkerOptions": (partial(ba_torchrl.WorkerOptions, parallel=False), itself),
-    "description": (partial(ba_torchrl.describe, PICKING), itself),
-    "card": (partial(read_card, shipped_file(PICKING)), itself),
-    "demonstrations": (loaded_demonstrations, itself),
     "noise of demonstrations": (noise, perturb),
 }
 """What is returned, and what copies must do like the original."""

@@ -3,9 +3,6 @@ import numpy as np
 import pytest
 from PIL import Image, ImageDraw
 
-from ba_torchrl import make
-from ba_torchrl.core import keys
-from ba_torchrl.record.video import FrameRecorder
 from recipes.gallery import (
     MOST_FRAMES,
     Strip,
@@ -118,22 +115,3 @@ def test_an_overview_has_start_and_goal_of_each_task_under_headings(tmp_path, te
         "ramp: house",
         "bump: house",
     ]
-
-
-def test_every_open_loop_step_has_a_frame_of_the_contact_and_one_after_it():
-    env = make("open_loop/block_stacking", num_objects=2, expert=True, seed=0)
-    recorder = FrameRecorder(env, 80, 80)
-    state = env.reset()
-    recorder.record()
-    while not state[keys.DONE]:
-        state = env.step(state.set(keys.ACTION, state[keys.EXPERT_ACTION]))[keys.NEXT]
-        recorder.record()
-    env.close()
-    assert len(recorder.frames) == 5
-    assert recorder.contacts == [1, 3]
-    assert recorder.frames[0].shape == (80, 80, 3)
-    changes = [
-        np.abs(a.astype(int) - b).sum()
-        for a, b in zip(recorder.frames, recorder.frames[1:], strict=False)
-    ]
-    assert min(changes) > 0

@@ -55,13 +55,6 @@ def test_beta_decreases_linearly_to_zero():
     assert torch.equal(*states)
 
 
-def test_two_iterations_of_a_run(tmp_path):
-    learner = run(tmp_path, "cnn", {"name": "dagger", "beta_init": 0.5})
-    is_expert = learner.replay.storage.column(keys.IS_DEMONSTRATION)
-    assert (~is_expert).sum() == 4
-    assert is_expert.any()
-
-
 def test_two_iterations_of_a_run_in_the_open_loop(tmp_path):
     settings = {"name": "dagger", "beta_init": 0.5}
     learner = run(tmp_path, "asr", settings, **OPEN)

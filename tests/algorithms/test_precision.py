@@ -4,13 +4,16 @@ import pytest
 import torch
 
 from tests.algorithms.tiny import SIZES, build, transitions
+from tests.specs import slow_except
 
 pytest.importorskip("escnn")
 
 WIDER = {**{name: {"width": 0.25} for name in SIZES}, "equi": {"group_order": 8, "n_hidden": 16}}
 
 
-@pytest.mark.parametrize("network", [name for name in SIZES if name != "ferm"])
+@pytest.mark.parametrize(
+    "network", slow_except([name for name in SIZES if name != "ferm"], ["cnn", "equi_asr"])
+)
 def test_losses_in_bfloat16(network):
     losses = {}
     algorithm = "sac" if network in ("cnn", "equi") else "spatial_q"

@@ -77,24 +77,17 @@ def taken_apart():
     )
 
 
-def test_observations_are_in_reverse_order(taken_apart):
+def test_entries_of_a_reversed_episode(taken_apart):
+    before = taken_apart.clone()
     built = reverse_episode(taken_apart)
     assert built["heightmap"][:, 0, 0, 0].tolist() == [4, 3, 2, 1]
     assert built["next", "heightmap"][:, 0, 0, 0].tolist() == [3, 2, 1, 0]
     assert built["action"].tolist() == [[0, 43], [1, 32], [0, 21], [1, 10]]
     assert built["holding"].flatten().tolist() == [False, True, False, True]
     assert built["next", "holding"].flatten().tolist() == [True, False, True, False]
-
-
-def test_in_hand_images_are_those_of_the_inverse_picks(taken_apart):
-    built = reverse_episode(taken_apart)
     # state 3 is held from the pick in state 4, state 1 from the pick in state 2
     assert built["in_hand"][:, 0, 0, 0].tolist() == [0, 54, 0, 52]
     assert built["next", "in_hand"][:, 0, 0, 0].tolist() == [54, 0, 52, 0]
-
-
-def test_the_last_step_has_the_reward_and_ends(taken_apart):
-    built = reverse_episode(taken_apart)
     at_end = [False, False, False, True]
     assert built["next", "reward"].flatten().tolist() == [0, 0, 0, 1]
     for key in ("success", "done", "terminated"):
@@ -103,11 +96,6 @@ def test_the_last_step_has_the_reward_and_ends(taken_apart):
     assert not built["next", "truncated"].any()
     assert built["step_count"].flatten().tolist() == [0, 1, 2, 3]
     assert built["next", "step_count"].flatten().tolist() == [1, 2, 3, 4]
-
-
-def test_the_original_episode_is_not_modified(taken_apart):
-    before = taken_apart.clone()
-    built = reverse_episode(taken_apart)
     built["heightmap"] = built["heightmap"] + 1
     built["next", "heightmap"] = built["next", "heightmap"] + 1
     assert (taken_apart == before).all()
@@ -176,15 +164,8 @@ def test_an_action_that_moved_no_or_two_bodies_has_no_inverse():
     assert before.undo_command(body, grasp) is None
 
 
-@pytest.mark.parametrize(
-    "task",
-    [
-        f"open_loop/{name}"
-        for name in ("block_stacking", "house_building_4", "improvise_house_building_2")
-    ],
-)
-def test_reversed_actions_build_the_structure(task):
-    scores = replay_scores(task, 8, seed=100)
+def test_reversed_actions_build_the_structure():
+    scores = replay_scores("open_loop/improvise_house_building_2", 8, seed=100)
     assert scores.reversible >= 0.75
     assert scores.success_rate >= 0.75
 
@@ -300,6 +281,6 @@ def test_episodes_are_collected_in_a_vector_of_environments():
     assert (keys.NEXT, keys.IN_HAND) in transitions.keys(include_nested=True)
 
 
-def test_tasks_without_a_structure_refuse_deconstruction():
+def test_tasks_without_a_structure_have_no_deconstruction():
     with pytest.raises(ConfigError, match="no meaning for close_loop/block_picking"):
         make_deconstruction_env("close_loop/block_picking")

@@ -7,37 +7,17 @@ from ba_torchrl.core import keys
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.training.checkpoint import load
-from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.learner import problem_of
+from tests.algorithms.tiny import make_experiment
 
-RUN = {
-    "task": "close_loop/block_reaching",
-    "env": {"obs_size": 64, "max_steps": 8},
-    "algorithm": {
-        "name": "mine/behaviour_cloning",
-        "batch_size": 16,
-        "optimizer": {"learning_rate": 3e-3},
-    },
-    "network": {"name": "cnn", "width": 0.25, "depth_center_m": 0.2, "depth_scale_m": 0.1},
-    "num_envs": 2,
-    "parallel": False,
-    "demonstrations": 4,
-    "total_updates": 40,
-    "min_replay": 1,
-    "eval_every": 40,
-    "eval_episodes": 2,
-    "final_eval_episodes": 2,
-    "log_every": 1,
-    "video_episodes": 0,
-}
+BATCH = {"name": "mine/behaviour_cloning", "batch_size": 16}
 
 
 @pytest.mark.parametrize("pretrain_updates", [0, pytest.param(40, marks=pytest.mark.slow)])
 def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
-    values = {**RUN, "pretrain_updates": pretrain_updates, "run_dir": str(tmp_path / "run")}
-    config = ExperimentConfig.parse(values)
-    experiment = Experiment(config, progress=False)
+    settings = {"pretrain_updates": pretrain_updates, "total_updates": 40, "eval_every": 40}
+    settings["env"] = {"obs_size": 64, "max_steps": 8}
+    experiment = make_experiment(tmp_path, "cnn", BATCH, **settings)
     assert experiment.run().updates == 40
     losses = read_scalars(tmp_path / "run")["train/loss_actor"].values
     assert losses[-10:].mean() < 0.8 * losses[:10].mean()
@@ -55,12 +35,12 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
         assert torch.equal(a, b)
 
 
-def test_overriding_one_method_replaces_one_part(additions):
+def test_overriding_one_method_replaces_one_part(additions, tmp_path):
     class Augmented(additions["behaviour_cloning"].BehaviourCloning):
         def make_transforms(self):
             return [SO2Augmentation(self.images, self.problem.actions.sequence, seed=0)]
 
-    config = ExperimentConfig.parse(RUN)
+    config = make_experiment(tmp_path, "cnn", BATCH).config
     learner = Augmented(config.algorithm_config, config.network_config, problem_of(config))
     assert isinstance(learner.replay.transform[0], SO2Augmentation)
     assert learner.target_updater is None

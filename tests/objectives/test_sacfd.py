@@ -235,16 +235,6 @@ def test_renamed_keys():
         renamed.set_keys(colour="red")
 
 
-def test_forward_accepts_keyword_tensors():
-    loss, data = make(), batch(weights=None)
-    expected = loss(data.clone())
-    named = {"_".join(key) if isinstance(key, tuple) else key: data[key] for key in loss.in_keys}
-    values = loss(**named)
-    assert len(values) == len(loss.out_keys)
-    for name, value in zip(loss.out_keys, values, strict=True):
-        torch.testing.assert_close(value, expected[name])
-
-
 def test_coefficients_can_be_scheduled_and_saved():
     loss, data = make(), batch()
     before = loss(data.clone())
@@ -365,22 +355,6 @@ def test_in_keys_can_be_set_and_follow_renamed_keys():
 
 EXPERTS = (True, True, False, True)
 WEIGHTS = (0.2, 0.8, 0.4, 0.1)
-
-
-def test_behaviour_term_pulls_the_sample_to_the_expert():
-    loss = make(alpha_init=1e-9, demonstration_weight=1.0)
-    data = batch()
-    with torch.no_grad():  # critics that do not care
-        loss.qvalue_network_params["module", "net", "weight"].zero_()
-    optimizer = torch.optim.SGD(loss.actor_network_params.parameters(), 0.1)
-    errors = []
-    for _ in range(20):
-        out = loss(data.clone())
-        errors.append(float(out["demonstration_error"]))
-        optimizer.zero_grad()
-        out["loss_actor"].backward()
-        optimizer.step()
-    assert all(later < earlier for earlier, later in itertools.pairwise(errors))
 
 
 def test_the_term_with_the_divergence_of_actions():

@@ -89,21 +89,6 @@ TASKS.register("mine_reach/near")(my_tasks.ReachNear)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "imports",
-    [
-        "import my_tasks, gymnasium",
-        "import gymnasium, my_tasks",
-        "import ba_torchrl, gymnasium, my_tasks",
-    ],
-)
-def test_gymnasium_knows_a_task_in_any_order_of_imports(folder, imports):
-    code = f"{imports}\nimport json; print(json.dumps(gymnasium.spec({GYM_ID!r}).kwargs))"
-    kwargs = last_line(run(folder, "-c", code))
-    assert kwargs == {"task": "mine/reach_near", "register_modules": ["my_tasks"]}
-
-
-@pytest.mark.slow
 def test_workers_of_gymnasium_import_the_module_of_the_task(folder):
     code = f"""
 import json, gymnasium, my_tasks
@@ -118,15 +103,22 @@ print(json.dumps(observation["depth"].shape))
 
 
 @pytest.mark.slow
-def test_spawned_workers_import_the_modules_of_task_and_robot(folder):
+@pytest.mark.parametrize(
+    ("task", "option", "key", "shape"),
+    [
+        ("mine/reach_near", "robot='mine/kuka'", "depth", [1, 3, 1, 16, 16]),
+        ("close_loop/block_reaching", "observations=['mine/opening']", "opening", [1, 3, 1]),
+    ],
+)
+def test_spawned_workers_import_the_modules_of_what_is_named(folder, task, option, key, shape):
     code = f"""
 import json, ba_torchrl, my_tasks
-env = ba_torchrl.make_vector_env("mine/reach_near", 1, robot="mine/kuka", {SMALL})
+env = ba_torchrl.make_vector_env("{task}", 1, {option}, {SMALL})
 rollout = env.rollout(3)
 env.close()
-print(json.dumps(list(rollout["depth"].shape)))
+print(json.dumps(list(rollout["{key}"].shape)))
 """
-    assert last_line(run(folder, "-c", code)) == [1, 3, 1, 16, 16]
+    assert last_line(run(folder, "-c", code)) == shape
 
 
 IN_MAIN = f"""
@@ -284,20 +276,6 @@ def test_the_recipes_take_a_plugin(folder):
     again = (recipes / "evaluate.py", PLUGIN, f"policy={folder}/runs/one", "episodes=1")
     done = run(elsewhere, *again, check=False)
     assert "cannot import the plugin 'my_tasks'" in done.stderr
-
-
-@pytest.mark.slow
-def test_spawned_workers_import_the_module_of_an_observation(folder):
-    code = """
-import json, ba_torchrl, my_tasks
-env = ba_torchrl.make_vector_env(
-    "close_loop/block_reaching", 1, observations=["mine/opening"], obs_size=16, seed=0
-)
-rollout = env.rollout(3)
-env.close()
-print(json.dumps(list(rollout["opening"].shape)))
-"""
-    assert last_line(run(folder, "-c", code)) == [1, 3, 1]
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """Files of measured rows: written, read, compared; only documented errors."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from profiling.speed_file import (
 from profiling.table import COLUMNS, Budget, Row, as_markdown
 from tests.recipes import recipe
 
-ROOT = Path(__file__).parents[2]
 ROWS = [
     Row("update", "s", [1.5, 1.25, 2.0], Budget("13.5", 2.0, None), [0.5, 0.25], [0.125], "a note"),
     Row("replay", "MB", [38.8]),

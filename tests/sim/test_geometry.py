@@ -135,9 +135,6 @@ def test_dot_cross_and_perpendicular():
     assert perpendicular((0.0, 0.0, 2.0), (0.0, 0.0, 1.0)) == (0.0, 0.0, 0.0)
 
 
-TRANSFORMS = r"getMatrixFrom|multiplyTransforms|invertTransform|getQuaternionFrom|getEuler"
-
-
 @pytest.mark.parametrize("seed", range(8))
 def test_matrices_and_quaternions_are_inverse(seed):
     x = np.random.default_rng(seed).normal(size=4)

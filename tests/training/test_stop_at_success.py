@@ -9,13 +9,10 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
 from tests.training.test_experiment import TINY
+from tests.training.test_resume import Interrupted, raise_interrupted
 
 UNTRAINED = 1.0
 RATES = [UNTRAINED, 0.9, 0.5, 1.0, 0.9, 1.0, 1.0]
-
-
-class Interrupted(BaseException):
-    """Ends a run like a kill."""
 
 
 def config_for(tmp_path, **changes):
@@ -65,13 +62,9 @@ def test_a_run_ends_while_it_learns_from_demonstrations_alone(tmp_path, seeds):
 def test_a_run_that_has_ended_takes_no_update_when_it_is_resumed(tmp_path, seeds, monkeypatch):
     first = Experiment(config_for(tmp_path), progress=False)
     with monkeypatch.context() as patch:
-        patch.setattr(experiments, "plot_curve", _interrupt)
+        patch.setattr(experiments, "plot_curve", raise_interrupted)
         with pytest.raises(Interrupted):
             first.run()
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
     experiment.algorithm.update = None
     assert experiment.run().updates == 8
-
-
-def _interrupt(*_):
-    raise Interrupted

@@ -10,7 +10,6 @@ from tensordict import TensorDict
 from torchrl.data import (
     LazyTensorStorage,
     PrioritizedSampler,
-    PrioritizedSliceSampler,
     TensorDictReplayBuffer,
 )
 from torchrl.data.replay_buffers.samplers import prioritized
@@ -149,34 +148,19 @@ def test_prioritised_buffers_of_torchrl_work_after_one_call_and_not_by_an_import
     assert "C++" not in done.stdout + done.stderr  # TorchRL's warning of its trees
 
 
-@pytest.mark.filterwarnings("error::UserWarning")
-def test_prioritised_slices_of_torchrl_start_by_priority():
-    sampler = PrioritizedSliceSampler(20, alpha=1.0, beta=1.0, slice_len=2, traj_key="episode")
-    buffer = TensorDictReplayBuffer(
-        storage=LazyTensorStorage(20), sampler=sampler, batch_size=2000, priority_key="td"
-    )
-    episode = torch.arange(4).repeat_interleave(5)
-    data = {"x": torch.arange(20), "episode": episode, "td": torch.ones(20)}
-    buffer.extend(TensorDict(data, [20]))
-    buffer.update_priority(torch.arange(20), torch.where(torch.arange(20) == 7, 100.0, 1e-3))
-    slices = buffer.sample()["x"].reshape(-1, 2)
-    assert torch.equal(slices[:, 1], slices[:, 0] + 1)
-    assert (slices[:, 0] == 7).float().mean() > 0.99
-
-
 def test_samplers_of_torchrl_are_loaded_fast(tmp_path):
-    """They set single leaves: 100,000 take half a minute if each is an array operation."""
-    sampler, other = (PrioritizedSampler(100_000, alpha=0.7, beta=0.5) for _ in range(2))
-    sampler.update_priority(torch.arange(90_000), torch.rand(90_000))
+    """They set single leaves: 20,000 take six seconds if each is an array operation."""
+    sampler, other = (PrioritizedSampler(20_000, alpha=0.7, beta=0.5) for _ in range(2))
+    sampler.update_priority(torch.arange(18_000), torch.rand(18_000))
     sampler.dumps(tmp_path)
     start = time.process_time()
     other.loads(tmp_path)
-    assert time.process_time() - start < 10
-    everything = torch.arange(100_000)
+    assert time.process_time() - start < 2
+    everything = torch.arange(20_000)
     for name in ("_sum_tree", "_min_tree"):
         first, second = getattr(sampler, name), getattr(other, name)
         assert torch.equal(torch.as_tensor(first[everything]), torch.as_tensor(second[everything]))
-        assert first.query(0, 70_000) == second.query(0, 70_000)
+        assert first.query(0, 14_000) == second.query(0, 14_000)
 
 
 def make(flags, bonus=1.0, seed=0, capacity=None, **settings):
@@ -345,16 +329,6 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
     _, wrong = make(FLAGS)
     with pytest.raises(ValueError, match="capacity"):
         wrong.load_state_dict(state)
-
-
-def test_a_large_checkpoint_is_saved_and_loaded_fast():
-    sampler = ExpertPrioritizedSampler(100_000, expert_bonus=0)
-    sampler.update_priority(torch.arange(100_000), torch.rand(100_000))
-    other = ExpertPrioritizedSampler(100_000, expert_bonus=0)
-    start = time.process_time()
-    other.load_state_dict(sampler.state_dict())
-    assert time.process_time() - start < 2
-    assert other._sum_tree.query(0, 100_000) == pytest.approx(sampler._sum_tree.query(0, 100_000))
 
 
 def test_invalid_arguments_are_refused():

@@ -41,7 +41,7 @@ class TestFailures:
         )
         assert state["step_count"].flatten().tolist() == [3, 1, 3]
 
-    @pytest.mark.parametrize("order", ["raise", "hang", "kill"])
+    @pytest.mark.parametrize("order", ["raise", "kill"])
     def test_in_step_and_maybe_reset(self, make_fakes, tmp_path, order):
         env = make_fakes(3, folder=tmp_path, timeout_s=5.0)
         _, before = env.step_and_maybe_reset(act(env, env.reset()))
@@ -145,15 +145,6 @@ class TestFailures:
             env.step_and_maybe_reset(act(env, state))
         assert env.is_closed
         assert multiprocessing.active_children() == []
-
-    def test_with_steps_in_between_do_not_add_up(self, make_fakes, tmp_path):
-        env = make_fakes(1, folder=tmp_path, max_restarts=1)
-        state = env.reset()
-        for _ in range(3):
-            (tmp_path / f"{env.worker_pids[0]}.step").write_text("raise")
-            _, state = env.step_and_maybe_reset(act(env, state))
-            _, state = env.step_and_maybe_reset(act(env, state))
-        assert env.restarts == 3
 
     def test_in_endless_resets_raise(self, make_fakes, tmp_path):
         env = make_fakes(2, folder=tmp_path, max_restarts=2)

@@ -6,23 +6,18 @@ from ba_torchrl.core import keys
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.learner import build_algorithm
+from tests.training import test_experiment
 
 SEED = 7
 TINY = {
-    "task": "close_loop/block_reaching",
+    **test_experiment.TINY,
     "env": {"obs_size": 64, "max_steps": 5},
     "algorithm": {"name": "dagger", "batch_size": 8},
-    "network": {"name": "cnn", "width": 0.25},
     "num_envs": 4,
-    "parallel": False,
     "start_method": "fork",
-    "demonstrations": 3,
-    "min_replay": 5,
+    "pretrain_updates": 0,
     "total_updates": 12,
     "eval_every": 6,
-    "eval_episodes": 2,
-    "final_eval_episodes": 2,
-    "log_every": 1,
     "video_episodes": 0,
 }
 

@@ -25,6 +25,7 @@ from tests.training.collectors.runs import (
     own_actions,
     start,
 )
+from tests.training.test_resume import interrupt
 
 KINDS = ("multi_sync", "multi_async")
 SLOW = pytest.mark.slow
@@ -250,21 +251,8 @@ def test_a_run_keeps_the_ratio_of_updates_to_steps_and_its_statistics(tmp_path):
 
 
 def test_a_stopped_run_continues_with_other_episodes(tmp_path):
-    class Stopped(Exception):
-        pass
-
     options = {"name": "multi_sync", "workers": 2}
-    experiment = Experiment(config_for(tmp_path, options), progress=False)
-    update = experiment.algorithm.update
-
-    def stop():
-        if experiment.algorithm.updates == 4:
-            raise Stopped
-        return update()
-
-    experiment.algorithm.update = stop
-    with pytest.raises(Stopped):
-        experiment.run()
+    interrupt(config_for(tmp_path, options), after=4)
     result = Experiment(config_for(tmp_path, options, resume=True), progress=False).run()
     assert result.updates == 12
     other = {"name": "multi_sync", "workers": 4}  # may change; the kind may not
