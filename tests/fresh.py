@@ -1,4 +1,4 @@
-"""Scripts in processes that have imported torch and TorchRL, and nothing of this package.
+"""Scripts in processes that have imported torch and other libraries, and nothing of this package.
 
 Each is forked from one server: it starts in milliseconds, `python script.py` in seconds.
 """
@@ -16,7 +16,10 @@ from subprocess import CompletedProcess
 
 CONTEXT = multiprocessing.get_context("forkserver")
 CONTEXT.set_forkserver_preload(
-    ["torch", *(f"torchrl.{name}" for name in ("collectors", "data", "envs", "modules"))]
+    [
+        *("torch", *(f"torchrl.{name}" for name in ("collectors", "data", "envs", "modules"))),
+        *("networkx", "numba", "pydantic", "scipy.spatial", "trimesh"),
+    ]
 )
 TIMEOUT_S = 240
 

@@ -10,6 +10,7 @@ from ba_torchrl.algorithms.sac import SAC
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from tests.algorithms.tiny import OPEN, build, make_experiment, transitions
+from tests.tasks.episodes import slow
 from tests.training.collectors.runs import config_for, start
 
 SIGMA = 0.2
@@ -76,7 +77,7 @@ def test_noise_of_ones_own_acts_under_random_only(own_noise, name, kind):
         assert all(torch.equal(found[0], each) for each in found)
 
 
-@pytest.mark.parametrize("changes", [{}, {"parallel": True, "start_method": "fork"}, OPEN])
+@pytest.mark.parametrize("changes", [*slow([{"parallel": True, "start_method": "fork"}]), OPEN])
 def test_a_run_with_noise_of_ones_own_is_evaluated_without(tmp_path, own_noise, changes):
     name, network = ("spatial_q", "asr") if changes is OPEN else ("sac", "cnn")
     experiment = make_experiment(tmp_path, network, {"name": name}, **changes)
@@ -85,7 +86,7 @@ def test_a_run_with_noise_of_ones_own_is_evaluated_without(tmp_path, own_noise, 
     assert noise.called_under == [ExplorationType.RANDOM] * 2  # its updates, one step each
 
 
-@pytest.mark.parametrize("kind", ["multi_sync", "multi_async"])
+@pytest.mark.parametrize("kind", ["multi_sync", *slow(["multi_async"])])
 def test_workers_collect_with_noise_of_ones_own(tmp_path, own_noise, kind):
     settings = {"name": "spatial_q", "epsilon_init": 0.0, "epsilon_end": 0.0, "batch_size": 8}
     collector = {"name": kind, "workers": 2}
@@ -99,15 +100,6 @@ def test_workers_collect_with_noise_of_ones_own(tmp_path, own_noise, kind):
     greedy = learner.policy(batch.select(*learner.policy.in_keys))[keys.ACTION]
     error = (batch[keys.ACTION] - greedy).abs()
     assert 0 < error.max() < 0.01
-
-
-@pytest.mark.parametrize(
-    "collector", ["single", pytest.param("multi_sync", marks=pytest.mark.slow)]
-)
-def test_a_run_collects_with_noise(tmp_path, collector):
-    algorithm = {"name": "sac", "exploration_noise": SIGMA}
-    settings = {"collector": {"name": collector}, "total_updates": 2, "eval_every": 2}
-    assert make_experiment(tmp_path, "cnn", algorithm, **settings).run().updates == 2
 
 
 def test_negative_noise_is_refused(tmp_path):

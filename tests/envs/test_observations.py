@@ -18,6 +18,7 @@ from ba_torchrl.envs.gym import GymEnv
 from ba_torchrl.envs.observations import OBSERVATIONS
 from ba_torchrl.sim.geometry import Pose, quaternion_matrix
 from ba_torchrl.tasks.instructions import color_name
+from tests.specs import slow_except_two_robots
 from tests.tasks.episodes import follow_expert
 
 PICKING = "close_loop/block_picking"
@@ -92,7 +93,7 @@ def red_share(image):
     return ((red > 2 * green) & (red > 2 * blue)).float().mean()
 
 
-@pytest.mark.parametrize("robot", ["kuka", "panda", "ur5", "ur5_robotiq"])
+@pytest.mark.parametrize("robot", slow_except_two_robots())
 def test_the_wrist_camera_sees_what_is_between_the_fingertips(make, robot):
     env = make("open_loop/block_stacking", "wrist_rgb", expert=True, robot=robot, camera_size=64)
     state = env.reset()

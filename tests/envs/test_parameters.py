@@ -53,14 +53,6 @@ def test_workspace_bounds_gripper_and_objects(make):
         assert -0.08 < y < 0.1
 
 
-def test_object_scale_range_sets_the_size(make):
-    for scale in (0.6, (0.8, 0.8)):
-        env = make(object_scale_range=scale)
-        env.reset()
-        expected = 0.05 * (scale if isinstance(scale, float) else scale[0])
-        np.testing.assert_allclose(env.scene.task.block.shape.size_m, expected)
-
-
 def test_obs_size_and_view_scale(make):
     for size in (32, 50):
         env = make(obs_size=size)
@@ -226,20 +218,19 @@ def test_obs_type_vec_lists_scaled_poses(make):
 
 
 def test_view_types_show_the_same_scene_differently(make):
-    images = {}
-    for view in VIEWS:
+    images = []
+    for view in (
+        "camera_center_xyz",
+        "camera_center_xy_height",
+        "render_center",
+        "camera_side_rgbd",
+    ):
         env = make("close_loop/block_pushing", view_type=view)
-        spec = env.observation_spec[keys.DEPTH]
-        state = act(env, env.reset(), x=0.6, r=0.7)
-        assert state[keys.DEPTH].shape == (VIEWS[view].channels, 32, 32)
-        assert spec.is_in(state[keys.DEPTH])
-        images[view] = state[keys.DEPTH]
-    # what lies on the floor is as high seen from a fixed camera as from one on the gripper
-    depths = [image for name, image in images.items() if not name.endswith("_height")]
-    heights = [images[f"camera_center_{axes}_height"] for axes in ("xyz", "xyzr", "z")]
-    for group in (depths, heights):
-        for first, second in itertools.combinations(group, 2):
-            assert first.shape != second.shape or not torch.equal(first, second)
+        images.append(act(env, env.reset(), x=0.6, r=0.7)[keys.DEPTH])
+        assert images[-1].shape == (VIEWS[view].channels, 32, 32)
+        assert env.observation_spec[keys.DEPTH].is_in(images[-1])
+    for first, second in itertools.combinations(images, 2):
+        assert first.shape != second.shape or not torch.equal(first, second)
 
 
 def test_rgb_adds_an_image_and_its_depth(make):
@@ -264,13 +255,8 @@ def test_point_cloud_adds_points_on_the_surfaces(make):
     assert points.dtype == torch.float32
     block = torch.tensor(env.scene.task.block.position)
     near = (points[:, :2] - block[:2]).norm(dim=1) < 0.02
-    top = near & (points[:, 2] > 0.04)
-    assert top.any()
-    torch.testing.assert_close(
-        points[top, 2], torch.full((int(top.sum()),), 0.05), atol=2e-3, rtol=0
-    )
-    floor = points[points[:, 2] < 0.01]
-    assert len(floor) > 100
+    assert points[near, 2].max() == pytest.approx(0.05, abs=2e-3)
+    assert (points[:, 2] < 0.01).sum() > 100  # the floor
 
 
 @pytest.mark.parametrize(

@@ -60,50 +60,46 @@ def policy_test(rate, seed=0, episodes=10):
     return TestedPolicy(updates=300, seeds=range(episodes), successes=outcomes, lengths=lengths)
 
 
-def write_run(
-    folder, rates, *, seed=0, final=None, task=REACH, label="sacfd equi", updates=UPDATES, **changes
-):
+RESULT = {
+    "task": REACH,
+    "label": "sacfd equi",
+    "benchmark": "close_loop_4d",
+    "protocol": 1,
+    "task_version": 0,
+    "expert_version": 0,
+    "demonstrations": 5,
+    "demonstration_steps": 400,
+    "env_steps": 1500,
+    "expert_labels": 0,
+    "precision": "float32",
+    "parameters": 1000,
+    "phase_seconds": {"updates": 1800.0},
+    "versions": {"torch": "2.13.0", "ba_torchrl": "0.1.0", "commit": "abc"},
+    "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gb": 8.0, "gpu": None, "threads": 2},
+    "finished": "2000-01-01T00:00:00+00:00",
+    "files": {},
+}
+"""Entries of the result of a run, without those of its curve and of its tests."""
+
+
+def write_run(folder, rates, *, seed=0, final=None, updates=UPDATES, **changes):
     """Write the files of a finished run; ``rates`` are the success rates of the curve."""
     folder.mkdir(parents=True)
-    config = {"task": task, "seed": seed, "env": {"obs_size": 64}, "run_dir": str(folder)}
-    config |= changes.pop("config", {})
-    values = {
-        "task": task,
-        "label": label,
-        "benchmark": "close_loop_4d",
+    values = {**RESULT, **changes}
+    config = {"seed": seed, "env": {"obs_size": 64}, "run_dir": str(folder)}
+    values["config"] = {"task": values["task"], **config, **changes.get("config", {})}
+    point = {"seconds": 60.0, "episodes": 10, "standard_error": 0.1, "mean_length": 7.0}
+    own = {
         "seed": seed,
         "curve": [
-            {
-                "updates": updates,
-                "env_steps": 5 * updates + seed,
-                "seconds": float(updates),
-                "episodes": 10,
-                "success_rate": rate,
-                "standard_error": 0.1,
-                "mean_length": 7.0,
-            }
-            for updates, rate in zip(updates, rates, strict=False)
+            {"updates": at, "env_steps": 5 * at + seed, "success_rate": rate, **point}
+            for at, rate in zip(updates, rates, strict=False)
         ],
         "last": policy_test(rates[-1] if final is None else final, seed),
         "best": policy_test(max(rates, default=final), seed),
-        "protocol": 1,
-        "task_version": 0,
-        "expert_version": 0,
-        "demonstrations": 5,
-        "demonstration_steps": 400,
-        "env_steps": 1500,
-        "expert_labels": 0,
-        "precision": "float32",
-        "parameters": 1000,
-        "phase_seconds": {"updates": 1800.0},
-        "config": config,
-        "versions": {"torch": "2.13.0", "ba_torchrl": "0.1.0", "commit": "abc"},
-        "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gb": 8.0, "gpu": None, "threads": 2},
         "seconds": 1800.0 + 360 * seed,
-        "finished": "2000-01-01T00:00:00+00:00",
-        "files": {},
     }
-    write_result(folder, RunResult(**{**values, **changes}))
+    write_result(folder, RunResult(**{**own, **values}))
     return folder
 
 

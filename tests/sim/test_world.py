@@ -1,7 +1,5 @@
-import hashlib
 from pathlib import Path
 
-import numpy as np
 import pybullet
 import pytest
 
@@ -119,44 +117,6 @@ def test_touches_detects_contact():
             b.place((0.05 + gap, 0, 0.025))
             world.step(2)
             assert a.touches(b) is expected
-
-
-def state_hash(env):
-    """Return a hash of all body poses, body velocities and joint states."""
-    scene = env.scene
-    client = scene.world.client
-    values = []
-    for body in scene.world.bodies:
-        values += sum(body.pose, ())
-        values += sum(pybullet.getBaseVelocity(body.id, physicsClientId=client), ())
-    joints = pybullet.getJointStates(scene.robot.id, range(14), physicsClientId=client)
-    values += [x for state in joints for x in state[:2]]
-    return hashlib.sha1(np.array(values).tobytes()).hexdigest()
-
-
-def test_episodes_repeat_bit_by_bit_after_other_episodes():
-    rng = np.random.default_rng(0)
-    actions = rng.uniform(-1, 1, (8, 5)).astype(np.float32)
-
-    def episode(env, seed):
-        import torch
-
-        state = env.reset(seed=seed)
-        hashes = [state_hash(env)]
-        for action in actions:
-            env.step(state.set("action", torch.from_numpy(action)))
-            hashes.append(state_hash(env))
-        return hashes
-
-    used = ba_torchrl.make("close_loop/block_pulling", obs_size=16)
-    fresh = ba_torchrl.make("close_loop/block_pulling", obs_size=16)
-    first = {seed: episode(used, seed) for seed in range(4)}
-    for seed in (2, 0, 3, 1, 1):
-        assert episode(used, seed) == first[seed]
-    assert episode(fresh, 3) == first[3]
-    assert first[0] != first[1]
-    used.close()
-    fresh.close()
 
 
 def resident_mb():

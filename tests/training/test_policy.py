@@ -94,9 +94,7 @@ def shipped():
         ("close_loop", {"dpos": 0.02}, "the environment takes .*dpos_m=0.02"),
     ],
 )
-def test_another_environment_than_in_training_is_refused(
-    shipped, control, changes, message, capsys
-):
+def test_another_environment_than_in_training_is_refused(shipped, control, changes, message):
     policy = shipped[control]
     with closing(policy.make_env(**changes)) as env:
         with pytest.raises(ConfigError, match=f"{message}.*policy.make_env"):
@@ -106,15 +104,18 @@ def test_another_environment_than_in_training_is_refused(
         if "environment takes" not in message:  # else it is not visible in an observation
             with pytest.raises(ConfigError, match=message):
                 policy(env.reset())
+
+
+def test_vectors_tests_and_commands_refuse_another_environment(shipped, capsys):
+    policy, changes, message = shipped["close_loop"], {"dpos": 0.02}, "takes .*dpos_m=0.02"
     options = {**policy.env_config, **changes, "parallel": False}
     with closing(ba_torchrl.make_vector_env(policy.task, 1, **options)) as envs:
         with pytest.raises(ConfigError, match=message):
             envs.rollout(50, policy)
         with pytest.raises(ConfigError, match=message):
             evaluation.evaluate(envs, policy, 1, seed=0)
-    words = [f"env.{name}={value}" for name, value in changes.items()]
     with pytest.raises(SystemExit):
-        recipe("play", policy.task, "policy=trained", "video=null", *words)
+        recipe("play", policy.task, "policy=trained", "video=null", "env.dpos=0.02")
     assert re.search(message, capsys.readouterr().err)
 
 

@@ -2,7 +2,6 @@
 
 import copy
 import itertools
-import pickle
 from functools import partial
 
 import pytest
@@ -323,14 +322,6 @@ def test_a_replay_for_several_processes_is_refused_by_name(name):
     env = partial(GymEnv, "CartPole-v1")
     with pytest.raises(RuntimeError, match=f"^{part} cannot be shared .*: collect without"):
         MultiSyncCollector([env], frames_per_batch=4, total_frames=4, replay_buffer=REPLAYS[name]())
-
-
-@pytest.mark.parametrize("kind", ["prioritized", "symmetric", "uniform"])
-def test_a_copy_continues_the_same_draws(kind):
-    buffer = make_replay(kind, SIZE, 4, codecs=CODECS, seed=0)
-    buffer.extend(transitions(20))
-    other = pickle.loads(pickle.dumps(buffer))
-    assert torch.equal(buffer.sample()["number"], other.sample()["number"])
 
 
 @pytest.mark.parametrize(

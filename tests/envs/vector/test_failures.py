@@ -146,6 +146,15 @@ class TestFailures:
         assert env.is_closed
         assert multiprocessing.active_children() == []
 
+    def test_with_steps_in_between_do_not_add_up(self, make_fakes, tmp_path):
+        env = make_fakes(1, folder=tmp_path, max_restarts=1)
+        state = env.reset()
+        for _ in range(3):
+            (tmp_path / f"{env.worker_pids[0]}.step").write_text("raise")
+            _, state = env.step_and_maybe_reset(act(env, state))
+            _, state = env.step_and_maybe_reset(act(env, state))
+        assert env.restarts == 3
+
     def test_in_endless_resets_raise(self, make_fakes, tmp_path):
         env = make_fakes(2, folder=tmp_path, max_restarts=2)
         (tmp_path / "all.reset").write_text("always raise")

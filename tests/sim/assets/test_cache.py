@@ -3,7 +3,6 @@
 import logging
 import multiprocessing
 import pwd
-from pathlib import Path
 
 import numpy as np
 
@@ -84,12 +83,6 @@ def test_a_user_without_a_home_has_no_cache(monkeypatch, caplog):
             (part,) = cached_parts(content, "recipe", make_box).parts
             assert isinstance(part, Mesh)
     assert caplog.text.count(CACHE_VARIABLE) == 1
-
-
-def test_the_default_cache_folder_is_the_users(monkeypatch):
-    monkeypatch.delenv(CACHE_VARIABLE)
-    monkeypatch.setattr(cache, "user_cache_path", lambda name: Path("/users/cache") / name)
-    assert cache.cache_folder() == Path("/users/cache/ba_torchrl/parts")
 
 
 def _write_shared_entries(seed):

@@ -22,7 +22,7 @@ from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.launchers import local
 from ba_torchrl.training.grid.plan import status
 from tests.recipes import recipe
-from tests.record.test_report import write
+from tests.record.test_report import RESULT, policy_test, write
 from tests.training.grid.grids import COMMON, REACH, planned
 
 FAKE_WORKER = """
@@ -52,32 +52,10 @@ results = json.loads((folder.parents[2] / "results.json").read_text())
 
 
 def result_of(run):
-    test = {"updates": 6, "seeds": [1, 2], "successes": [0, 1], "lengths": [4, 2]}
-    return RunResult(
-        protocol=1,
-        task=run.task,
-        task_version=0,
-        expert_version=0,
-        label=run.label,
-        benchmark=run.benchmark,
-        seed=run.seed,
-        curve=[],
-        last=test,
-        best=test,
-        demonstrations=3,
-        demonstration_steps=9,
-        env_steps=8,
-        expert_labels=0,
-        precision="float32",
-        parameters=10,
-        config=run.resolved(),
-        versions={},
-        hardware={},
-        seconds=1.0,
-        phase_seconds={},
-        finished="2000-01-01T00:00:00+00:00",
-        files={},
-    )
+    of_run = {name: getattr(run, name) for name in ("task", "label", "benchmark", "seed")}
+    test = policy_test(0.5, episodes=2)
+    own = {"curve": [], "last": test, "best": test, "config": run.resolved(), "seconds": 1.0}
+    return RunResult(**{**RESULT, **of_run, **own})
 
 
 @pytest.fixture

@@ -92,6 +92,7 @@ def test_skip_leaves_out_matching_runs(tmp_path):
         ({"skip": [{"task": REACH}]}, "grid is empty"),
         ({"tasks": []}, "tasks"),
         ({"seeds": 0}, "seeds"),
+        ({"seeds": 10**11}, "seeds"),
         ({"seeds": [1, 1]}, "names one twice"),
         ({"networks": ["cnn", "cnn"]}, "names one twice"),
         ({"sedes": 3}, "Did you mean 'seeds'"),
