@@ -1,4 +1,4 @@
-"""Draw the tasks: a picture and a film of each, and one picture of all.
+"""Draw the tasks: a picture and a film of each, and one picture of all, in new files.
 
 python recipes/gallery.py                       # in runs/gallery
 python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png films=true
@@ -25,6 +25,7 @@ from ba_torchrl.cli.types import (
     PngFile,
     Seed,
     Tasks,
+    check_new,
     checked,
 )
 from ba_torchrl.core import keys
@@ -93,6 +94,9 @@ def main(settings: Settings) -> None:
         task: folder / f"{task.replace('/', '_')}_deconstruction.png"
         for task in settings.deconstructions
     }
+    overview = [] if settings.overview is None else [settings.overview]
+    for path in [*files.values(), *films.values(), *apart.values(), *overview]:
+        check_new(path)
     for task, path in tqdm(files.items(), unit="task"):
         strip = strips[task] = expert_strip(task, settings.seed, pictures=2)
         still = Image.fromarray(strip.pictures[-1]).resize((STILL, STILL))
@@ -103,8 +107,8 @@ def main(settings: Settings) -> None:
     for task, path in apart.items():
         strip = expert_strip(task, settings.seed, pictures=2, deconstruct=True)
         print(write(labelled(f"{task}, deconstruction", strip.pictures), path))
-    if settings.overview is not None:
-        print(write(overview_of(strips), Path(settings.overview)))
+    for path in overview:
+        print(write(overview_of(strips), Path(path)))
 
 
 def expert_strip(task: str, seed: int, pictures: int = 4, *, deconstruct: bool = False) -> Strip:

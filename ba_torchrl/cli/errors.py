@@ -17,8 +17,12 @@ from ba_torchrl.cli import EXIT_CODE, ends_with_reader
 from ba_torchrl.core.errors import ConfigError, PartError, SettingsError, as_os_error
 from ba_torchrl.training import hydra_schema
 
-_OF_DEFECTS = {None, errno.EBADF, errno.EINVAL, errno.ENOENT}
-"""Numbers of errors of the system that are a program's, not of its resources."""
+_OF_RESOURCES = {
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG),
+    *(errno.EACCES, errno.EPERM, errno.EROFS),
+    *(errno.ENOMEM, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
+}
+"""Numbers of errors of the system that a user can mend; others are of defects of the program."""
 
 
 def plain_errors(function: Callable[..., Any]) -> Callable[..., Any]:
@@ -56,7 +60,7 @@ def _text(error: Exception) -> str | None:
     if isinstance(error, MemoryError) or type(error).__name__ == "OutOfMemoryError":  # of torch
         return f"out of memory: {error}"
     of_system = error if isinstance(error, OSError) else as_os_error(error)
-    if of_system is None or of_system.errno in _OF_DEFECTS:
+    if of_system is None or of_system.errno not in _OF_RESOURCES:
         return None
     return f"out of memory: {of_system}" if of_system.errno == errno.ENOMEM else str(of_system)
 

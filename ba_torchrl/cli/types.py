@@ -95,7 +95,6 @@ Folders = Annotated[
 ]
 """Existing folders, or one."""
 OutputFolder = Annotated[Text, checked(check_writable_folder)]
-OutputFile = Annotated[Text, checked(check_writable_file)]
 NewPath = Annotated[Text, checked(check_new), checked(check_writable_file)]
 PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
 VideoFile = Annotated[

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import OutputFile, PluginSettings, Text, checked
+from ba_torchrl.cli.types import NewPath, PluginSettings, Text, checked
 from ba_torchrl.demonstrations.formats.base import FORMATS, card_file
 
 
@@ -23,7 +23,7 @@ class Settings(PluginSettings):
     """A folder that collect wrote."""
     format: Annotated[Text, checked(FORMATS.__getitem__)]
     """Of the library."""
-    path: OutputFile
+    path: NewPath
     """New file or folder."""
 
 

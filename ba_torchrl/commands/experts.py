@@ -16,8 +16,8 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
     Count,
     EnvSettings,
+    NewPath,
     NumEnvs,
-    OutputFile,
     Tasks,
     VectorSettings,
     checked,
@@ -54,6 +54,8 @@ class Settings(VectorSettings, EnvSettings):
         "seed": "set seed",
         "robot": "set robots",
         "expert": "know that all episodes are the expert's",
+        "action_sequence": "read the column that it names",
+        "random_orientation": "read the column that it names",
     }
     tasks: Tasks = None
     """Ids of tasks; null for all."""
@@ -63,8 +65,8 @@ class Settings(VectorSettings, EnvSettings):
     """Episodes of each entry."""
     num_envs: NumEnvs = 2
     """Environments that step together."""
-    path: OutputFile | None = None
-    """A file that the tables are written to."""
+    path: NewPath | None = None
+    """A new file that the tables are written to."""
 
 
 def main(settings: Settings) -> None:

@@ -12,7 +12,7 @@ from pathlib import Path
 from pydantic import Field
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import OutputFile, Text, check_writable_file
+from ba_torchrl.cli.types import NewPath, Text, check_new, check_writable_file
 from ba_torchrl.commands import evaluate
 
 
@@ -21,7 +21,7 @@ class Settings(evaluate.EpisodeSettings):
 
     policy: Text
     """A run folder, one of the checkpoints in it, or a .safetensors file."""
-    path: OutputFile | None = None
+    path: NewPath | None = None
     """New file; null for one named after the task."""
     device: Text = "cpu"
     """Where the policy is computed."""
@@ -36,6 +36,7 @@ def main(settings: Settings) -> None:
 
     policy = load_policy(settings.policy, settings.which, settings.device)
     path = Path(settings.path or f"{policy.task.replace('/', '_')}{TENSORS}")
+    check_new(path)
     check_writable_file(path, suffixes=(TENSORS,))
     round_weights(policy)
     card = save_policy(policy, path, evaluate.play(policy, settings))

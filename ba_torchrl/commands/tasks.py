@@ -11,7 +11,7 @@ from collections.abc import Iterable
 
 from ba_torchrl import describe, list_tasks
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import OutputFile, PluginSettings, Tasks
+from ba_torchrl.cli.types import NewPath, PluginSettings, Tasks
 from ba_torchrl.core.files import write_text
 from ba_torchrl.envs.description import summary, tasks_by_heading
 from ba_torchrl.tasks.base import TASKS
@@ -22,8 +22,8 @@ class Settings(PluginSettings):
 
     tasks: Tasks = None
     """Ids of tasks; null for all."""
-    path: OutputFile | None = None
-    """Write the page of the tasks, in Markdown, to this file."""
+    path: NewPath | None = None
+    """Write the page of the tasks, in Markdown, to this new file."""
 
 
 def main(settings: Settings) -> None:

@@ -42,9 +42,14 @@ REFUSED = [
     ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),
     ("experts", "env.num_envs=3", "unknown parameter 'num_envs'"),
     ("experts", "env.robot=ur5", "env: robot is set by the command; leave it out, and set robots"),
+    ("experts", "env.action_sequence=pxy", "leave it out, and read the column that it names"),
+    ("experts", "path=file", "file exists already; choose another path"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
     ("plot", "runs=[run]", "cannot read the scalars of run"),
+    ("tasks", "path=file", "file exists already; choose another path"),
+    ("export", "path=file", "file exists already; choose another path"),
+    ("gallery", "folder=pictures", "pictures/close_loop_block_reaching.png exists already"),
     ("leaderboard", "runs=demos", "no run below demos"),
     ("report", "folder=file/x", "cannot write to "),
     ("measure", "output=folder.json", "cannot write to "),
@@ -80,6 +85,8 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     (tmp_path / "folder.png").mkdir()
     (tmp_path / "folder.json").mkdir()
     (tmp_path / "demos/close_loop_block_pulling").mkdir(parents=True)
+    (tmp_path / "pictures").mkdir()
+    (tmp_path / "pictures/close_loop_block_reaching.png").touch()
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.json").write_text(json.dumps(RUN))
     (tmp_path / "run/scalars.csv").write_text("step,name,value\n5,torn\n")
@@ -108,7 +115,7 @@ def test_play_says_whether_each_episode_succeeded(capsys):
         ("Tasks", None, [3, [], ["close_loop/none"], [1]]),
         ("Folders", "run", ["nope", [], ["nope"], 5, None, [1], LONG]),
         ("OutputFolder", "new", ["file", "file/x", "/proc/nope/x", "/dev/full/x", LONG]),
-        ("OutputFile", "new.md", ["run", "file/x", "/proc/nope/x", "/dev/full/x", LONG]),
+        ("NewPath", "new.md", ["run", "file", "file/x", "/proc/nope/x", "/dev/full/x", LONG]),
         ("PngFile", "new.png", ["new.nope", "file/x.png", "folder.png"]),
         ("VideoFile", "new.GIF", ["new.avi", "/dev/full/x.mp4"]),
     ],
@@ -163,9 +170,10 @@ def raised(error):
     raise error
 
 
-def test_a_defect_is_no_error_of_resources():
+@pytest.mark.parametrize("number", [errno.EINVAL, errno.EEXIST, errno.EISDIR, errno.ENOTEMPTY])
+def test_a_defect_is_no_error_of_resources(number):
     with pytest.raises(OSError, match="a defect"):
-        raised(OSError(errno.EINVAL, "a defect"))
+        raised(OSError(number, "a defect"))
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root can write everywhere")

@@ -11,7 +11,7 @@ OURS = [task for task in ba_torchrl.list_tasks() if not task.startswith("mine/")
 
 def test_the_page_is_up_to_date():
     assert PAGE.read_text(encoding="utf-8") == tasks.page(OURS), (
-        "run `ba-torchrl tasks path=docs/tasks.md`"
+        "delete it and run `ba-torchrl tasks path=docs/tasks.md`"
     )
 
 
