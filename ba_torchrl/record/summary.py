@@ -241,12 +241,14 @@ def grouped(runs: Iterable[Run]) -> list[Group]:
 
     Methods with several settings get distinct names.
     """
-    by_settings: dict[tuple[str, ...], list[Run]] = {}
+    by_method: dict[tuple[str, str], list[list[Run]]] = {}
     for run in runs:
-        settings = {name: value for name, value in run.settings.items() if value is not None}
-        key = run.result.task, run.result.label, repr(sorted(settings.items()))
-        by_settings.setdefault(key, []).append(run)
-    alike = [*by_settings.values()]
+        known = by_method.setdefault((run.result.task, run.result.label), [])
+        equal = next((members for members in known if not run.differences(members[0])), None)
+        if equal is None:
+            known.append(equal := [])
+        equal.append(run)
+    alike = [members for known in by_method.values() for members in known]
     groups, twice = [], []
     for members in alike:
         result, seeds = members[0].result, [run.result.seed for run in members]

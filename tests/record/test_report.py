@@ -220,6 +220,13 @@ def test_runs_with_other_values_do_not_have_the_name_of_the_benchmark(tmp_path):
     assert "tau is 0.5 instead of 0.1" in (tmp_path / "report/table.md").read_text()
 
 
+def test_runs_with_equal_settings_are_averaged_however_they_are_written(tmp_path):
+    for seed, config in enumerate([{"tau": 1, "x": None, "y": (1, 2)}, {"y": [1, 2], "tau": 1.0}]):
+        write_run(tmp_path / str(seed), (0, 0, 1), seed=seed, config=config)
+    (section,) = load(tmp_path)
+    assert [len(group.runs) for group in section.groups] == [2]
+
+
 def test_runs_with_other_settings_are_not_averaged(tmp_path):
     write_run(tmp_path / "a", (0, 0, 0), seed=0)
     write_run(tmp_path / "b", (0, 0, 0), seed=1)
