@@ -72,10 +72,10 @@ def main(task: Task) -> None:
             print(f"{run.task:36} {run.label:20} seed {run.seed:<3} {state}")
         counts = Counter(state.state for _, state in states)
         print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
-    print_estimate(states, config.jobs)
+    launcher = choose(LAUNCHERS, config.launcher, "launcher")
+    print_estimate(states, launcher.runs_at_once(config.jobs))
     if config.dry_run:
         return
-    launcher = choose(LAUNCHERS, config.launcher, "launcher")
     launcher.check(runs)
     # the runs end with this process
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
@@ -101,7 +101,7 @@ def main(task: Task) -> None:
         print(f"  next    ba-torchrl report {config.folder}")
 
 
-def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], jobs: int) -> None:
+def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], at_once: int) -> None:
     """Print how long the runs take that are not done, if some of the same task and method are."""
     seconds = defaultdict(list)
     for run, state in states:
@@ -109,9 +109,10 @@ def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], jobs: int)
     left = [seconds[run.task, run.label] for run, state in states if state.state != "done"]
     known = [fmean(each) for each in left if each]
     if known:
-        jobs = min(jobs, len(known))
-        duration, runs = timedelta(seconds=round(sum(known) / jobs)), f"{len(known)} of {len(left)}"
-        print(f"about {duration} h for {runs} runs, {jobs} at a time, as finished ones took")
+        at_once = min(at_once, len(known))
+        duration = timedelta(seconds=round(sum(known) / at_once))
+        runs = f"{len(known)} of {len(left)}"
+        print(f"about {duration} h for {runs} runs, {at_once} at a time, as finished ones took")
 
 
 COMMAND = Command(

@@ -356,6 +356,9 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
     listed = printed("seeds=2", "dry_run=true")
     assert "2 runs: 1 done, 1 failed" in listed
     assert re.search(r"about 0:00:\d\d h for 1 of 1 runs", listed)
+    more = ("seeds=3", "dry_run=true", "jobs=2")
+    assert "for 2 of 2 runs, 2 at a time" in printed(*more)
+    assert "for 2 of 2 runs, 1 at a time" in printed(*more, "launcher=ray")  # jobs has no effect
 
     def interrupted(*_, **__):
         raise KeyboardInterrupt

@@ -33,6 +33,10 @@ class LauncherConfig(StrictModel, ABC):
         """Raise `ConfigError` unless the launcher can be used, before anything starts."""
         return
 
+    def runs_at_once(self, jobs: int) -> int:
+        """Return how many runs of ``jobs`` take place at the same time; 1 if it is not known."""
+        return 1
+
     @abstractmethod
     def run_all(self, grid: Grid) -> dict[Path, str]:
         """Run the unfinished runs of a grid, resume the interrupted ones, and wait for their end.
@@ -43,5 +47,5 @@ class LauncherConfig(StrictModel, ABC):
 
 
 LAUNCHERS: Registry[type[LauncherConfig]] = Registry(
-    "launcher", "ba_torchrl.training.grid.launchers"
+    "launcher", "ba_torchrl.training.grid.launchers", LauncherConfig
 )
