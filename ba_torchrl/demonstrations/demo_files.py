@@ -26,6 +26,7 @@ from ba_torchrl.core.files import (
 )
 from ba_torchrl.demonstrations.episodes import mean_return, success_rate
 from ba_torchrl.demonstrations.exchange import (
+    check_entries,
     check_same_environment,
     count_demonstrations,
     env_values,
@@ -68,13 +69,15 @@ def save_demonstrations(
     Raises:
         ValueError: there are no episodes.
         FileExistsError: the folder already holds demonstrations.
-        ConfigError: another process writes it.
+        ConfigError: another process writes it, or the episodes have not the observations and
+            actions of the task's environment.
     """
     if not episodes:
         raise ValueError("there are no episodes to save")
     path = Path(path)
     if path.exists() and any(path.iterdir()):
         raise FileExistsError(f"{path} is not empty; choose another folder")
+    check_entries(episodes, task, env)
     lengths = torch.tensor([len(episode) for episode in episodes], device="cpu")
     steps = torch.cat(list(episodes)).flatten_keys(_SEPARATOR)
     entries: dict[str, Any] = {}

@@ -88,20 +88,11 @@ def export_demonstrations(
         raise ConfigError(f"{path} could not be read back; end the path in {form.suffixes[0]}")
     if os.path.lexists(path):
         raise ConfigError(f"{path} exists already; choose another path")
+    check_entries(episodes, task, env)
     roles = _roles(episodes[0])
-    specs = entry_specs(resolve_env(task, env))
-    for number, episode in enumerate(episodes):
-        if missing := {*roles, *specs} - set(_roles(episode)):
-            raise ConfigError(
-                f"episode {number} has no {', '.join(sorted(missing))}, as episode 0 or the "
-                "environment has"
-            )
-        if not len(episode):
-            raise ConfigError(f"episode {number} has no steps")
     arrays = [_to_arrays(episode, roles) for episode in episodes]
     entries = {key: _entry(key, role, arrays[0][key]) for key, role in roles.items()}
     shapes = {key: entry.shape for key, entry in entries.items()}
-    shapes |= {key: tuple(spec.shape) for key, spec in specs.items()}
     for number, each in enumerate(arrays):
         for key, shape in shapes.items():
             if each[key].shape[1:] != shape:
@@ -135,6 +126,25 @@ def export_demonstrations(
         entries=entries,
     )
     write_file(form, path, arrays, card)
+
+
+def check_entries(episodes: Sequence[TensorDictBase], task: str, env: dict[str, Any]) -> None:
+    """Raise `ConfigError` unless all episodes [T] have the entries of the first, and of the
+    environment those and the shapes of its observations and actions."""
+    specs = entry_specs(resolve_env(task, env))
+    roles = _roles(episodes[0])
+    for number, episode in enumerate(episodes):
+        if missing := {*roles, *specs} - set(_roles(episode)):
+            raise ConfigError(
+                f"episode {number} has no {', '.join(sorted(missing))}, as episode 0 or the "
+                "environment has"
+            )
+        if not len(episode):
+            raise ConfigError(f"episode {number} has no steps")
+        for key, spec in specs.items():
+            if episode[key].shape[1:] != spec.shape:
+                found = f"the shape {list(episode[key].shape[1:])}"
+                raise ConfigError(f"episode {number}: {key} has {found}, needed {list(spec.shape)}")
 
 
 def _instruction(task: str, env: dict[str, Any]) -> str:

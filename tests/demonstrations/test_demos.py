@@ -149,6 +149,21 @@ def test_demonstrations_are_not_overwritten(collected, tmp_path):
         save_demonstrations(tmp_path, episodes, task=TASK, env=ENV, seed=1)
 
 
+@pytest.mark.parametrize(
+    ("task", "changes", "message"),
+    [
+        ("close_loop/block_reaching", {}, "episode 0 has no depth, as"),
+        (TASK, {"observations": ["proprio"]}, "episode 0 has no proprio"),
+        (TASK, {"in_hand_mode": "proj"}, r"in_hand has the shape \[1, .*, needed \[3, "),
+        (TASK, {"action_sequence": "pxy", "random_orientation": False}, "action has the shape"),
+    ],
+)
+def test_episodes_of_another_environment_are_not_saved(collected, tmp_path, task, changes, message):
+    env = {**ENV, **changes} if task == TASK else changes
+    with pytest.raises(ConfigError, match=message):
+        save_demonstrations(tmp_path / "demos", collected[1], task=task, env=env, seed=0)
+
+
 def test_a_folder_that_is_not_complete_is_removed(collected, tmp_path, monkeypatch):
     monkeypatch.setattr(demo_files, "seal", lambda folder: 1 / 0)
     with pytest.raises(ZeroDivisionError):
