@@ -63,9 +63,9 @@ def outcome(experiment):
     """Return all that a run learnt and recorded."""
     folder = experiment.config.folder
     state = experiment.algorithm.state_dict()
-    result = read_result(folder).model_dump(
-        exclude={"seconds", "phase_seconds", "finished", "resumed_at", "files", "config", "curve"}
-    )
+    excluded = {"seconds", "phase_seconds", "finished", "resumed_at", "files", "config", "curve"}
+    excluded |= {"versions"}  # with the commit, which may change between two runs
+    result = read_result(folder).model_dump(exclude=excluded)
     curve = [point.model_dump(exclude={"seconds"}) for point in read_result(folder).curve]
     scalars = {
         name: (series.steps.tolist(), series.values.tolist())

@@ -103,6 +103,10 @@ def map_pairs(
             shape.
     """
     image = tensordict[key]
+    if not image.is_floating_point():
+        raise ConfigError(
+            f"{key} holds codes, {image.dtype}: append the rotation after ImageCodecs"
+        )
     images = torch.cat([image, tensordict[keys.NEXT, key]], dim=1)
     rows = to_device(rows, images.device)
     images[rows] = transform(images[rows])

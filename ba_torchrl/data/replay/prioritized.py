@@ -152,8 +152,8 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             storage: storage with the expert flags, which TorchRL's buffers pass.
 
         Raises:
-            ValueError: a priority is not finite, or the storage is missing and the bonus is not
-                zero.
+            ValueError: a priority is not finite, an index is beyond ``max_capacity``, or the
+                storage is missing and the bonus is not zero.
         """
         index = torch.stack(index, -1) if isinstance(index, tuple) else index
         index = torch.as_tensor(index, dtype=torch.long, device="cpu")
@@ -168,7 +168,7 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         is_stored = index >= 0
         index, error = index[is_stored], error.abs().expand(index.shape)[is_stored]
         if len(index):
-            super().update_priority(index, error + self.eps + self._bonus(index, storage))
+            self._set(index, error + self.eps + self._bonus(index, storage))
 
     @torch.no_grad()
     def mark_update(self, index: int | Tensor, *, storage: Storage | None = None) -> None:
@@ -180,7 +180,15 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         """
         largest, _ = self._max_priority
         largest = torch.as_tensor(largest or 1.0, dtype=self.dtype, device="cpu").clamp_min(1.0)
-        super().update_priority(index, largest, storage=storage)
+        self._set(index, largest, storage)
+
+    def _set(self, index: Any, priority: Tensor, storage: Storage | None = None) -> None:
+        if (torch.as_tensor(index) >= self._max_capacity).any():
+            raise ValueError(
+                f"the storage holds more than max_capacity={self._max_capacity} transitions: give "
+                "the sampler the capacity of the storage"
+            )
+        super().update_priority(index, priority, storage=storage)
 
     def _bonus(self, index: Tensor, storage: Storage | None) -> Tensor | float:
         if not self.expert_bonus:

@@ -185,6 +185,10 @@ def test_draws_come_from_the_modules_own_generator():
 def test_episodes_of_several_dimensions_are_refused_with_the_way_out():
     with pytest.raises(ConfigError, match=r"SO2Augmentation takes .* \[B\], .*reshape\(-1\)"):
         SO2Augmentation(IMAGES, "pxyzr", seed=0)(batch(n=4).reshape(2, 2))
+    codes = batch()
+    codes[keys.DEPTH] = codes[keys.DEPTH].byte()
+    with pytest.raises(ConfigError, match=r"depth holds codes, torch.uint8: .* after ImageCodecs"):
+        SO2Augmentation(IMAGES, "pxyzr", seed=0)(codes)
 
 
 def test_invalid_arguments_are_refused():

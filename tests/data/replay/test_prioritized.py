@@ -337,6 +337,8 @@ def test_invalid_arguments_are_refused():
         buffer.update_priority(torch.tensor([0]), torch.tensor([float("nan")]))
     with pytest.raises(ValueError, match="storage"):
         sampler.update_priority(torch.tensor([0]), 1.0)
+    with pytest.raises(ValueError, match=r"more than max_capacity=\d+ transitions: give"):
+        sampler.mark_update(torch.arange(len(FLAGS) + 1))
     with pytest.raises(ValueError, match="eps"):
         ExpertPrioritizedSampler(4, eps=0)
     empty = ExpertPrioritizedSampler(4)
