@@ -17,8 +17,6 @@ from ba_torchrl.core.registry import Registry
 from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.base import NETWORKS, Control, NetworkConfig
 
-ALGORITHMS: Registry[type[LearnerConfig]] = Registry("algorithm", "ba_torchrl.algorithms")
-
 
 class LearnerConfig(StrictModel, ABC):
     """Hyper-parameters of an algorithm, from which it is built for a network and a problem.
@@ -75,3 +73,8 @@ class LearnerConfig(StrictModel, ABC):
     @abstractmethod
     def build(self, network: NetworkConfig, problem: Problem) -> Any:
         """Return a freshly initialised `ba_torchrl.algorithms.base.Learner`."""
+
+
+ALGORITHMS: Registry[type[LearnerConfig]] = Registry(
+    "algorithm", "ba_torchrl.algorithms", LearnerConfig
+)

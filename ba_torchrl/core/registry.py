@@ -40,11 +40,13 @@ class Registry(Generic[T]):
     Args:
         kind: what the entries are, in the singular, for error messages ("task").
         package: dotted name of the package whose modules hold the built-in entries.
+        base: class of the entries, or from which they derive.
     """
 
-    def __init__(self, kind: str, package: str) -> None:
+    def __init__(self, kind: str, package: str, base: type = object) -> None:
         self.kind = kind
         self.package = package
+        self.base = base
         self._entries: dict[str, T] = {}
         self._modules: dict[str, str] = {}
         self._is_scanned = False
@@ -56,7 +58,8 @@ class Registry(Generic[T]):
         new definition replaces the old one.
 
         Raises:
-            ConfigError: another object already has that name, or it is not one.
+            ConfigError: another object already has that name, or it is not one; or the argument
+                does not derive from the base class.
         """
         if not isinstance(name, str) or not _NAME.fullmatch(name):
             raise ConfigError(
@@ -66,6 +69,9 @@ class Registry(Generic[T]):
         module = sys._getframe(1).f_globals.get("__name__", "__main__")
 
         def decorate(entry: T) -> T:
+            if not issubclass(entry if isinstance(entry, type) else type(entry), self.base):
+                base = f"{self.base.__module__}.{self.base.__qualname__}"
+                raise ConfigError(f"{self.kind} {name!r}: {entry!r} does not derive from {base}")
             known = self._entries.get(name, entry)
             if known is not entry and not _is_redefinition(known, entry):
                 modules = {self._modules[name], module}

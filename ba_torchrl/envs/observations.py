@@ -30,8 +30,6 @@ from ba_torchrl.tasks.workspace import Workspace
 WRIST_RANGE_M = (0.02, 2.0)
 """Near and far plane of the wrist camera."""
 
-OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.envs")
-
 
 class Observation(ABC):
     """Entries that are added to every observation."""
@@ -61,6 +59,9 @@ class Observation(ABC):
     @abstractmethod
     def observe(self, scene: Scene) -> dict[str, Tensor | NonTensorData]:
         """Return its entries, by key."""
+
+
+OBSERVATIONS: Registry[type[Observation]] = Registry("observation", "ba_torchrl.envs", Observation)
 
 
 def enabled_observations(config: EnvConfig, workspace: Workspace) -> list[Observation]:

@@ -111,4 +111,4 @@ class NetworkConfig(StrictModel, ABC):
         """
 
 
-NETWORKS: Registry[type[NetworkConfig]] = Registry("network", "ba_torchrl.modules")
+NETWORKS: Registry[type[NetworkConfig]] = Registry("network", "ba_torchrl.modules", NetworkConfig)

@@ -25,8 +25,6 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.terrain.flat import Flat, Terrain
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
-TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks")
-
 BLOCK_M = 0.05
 """Edge of a block at scale 1."""
 
@@ -295,6 +293,9 @@ class Task(ABC):
     def stand(self, body: Body, xy: tuple[float, float], yaw_rad: float) -> None:
         """Place a body on the ground."""
         self.terrain.stand(body, xy, yaw_rad)
+
+
+TASKS: Registry[type[Task]] = Registry("task", "ba_torchrl.tasks", Task)
 
 
 class OpenLoopTask(Task):

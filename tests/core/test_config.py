@@ -5,13 +5,18 @@ from omegaconf import OmegaConf
 from tensordict import TensorDict
 
 import ba_torchrl
+from ba_torchrl.algorithms.config import ALGORITHMS
 from ba_torchrl.core.config import TaskParameters, parse
 from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.data import RigidAugmentation, as_transitions, make_replay
+from ba_torchrl.demonstrations.formats.base import FORMATS
+from ba_torchrl.envs.observations import OBSERVATIONS
+from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.objectives import BehaviourCloningLoss, LevelDQNLoss
+from ba_torchrl.tasks.base import TASKS
 
 
 @pytest.mark.parametrize(
@@ -114,6 +119,13 @@ def test_registry_refuses_two_entries_of_one_name():
         registry.register("a")(2)
     with pytest.raises(UnknownNameError, match="unknown thing 'b'"):
         registry["b"]
+
+
+@pytest.mark.parametrize("registry", [TASKS, NETWORKS, ALGORITHMS, OBSERVATIONS, FORMATS])
+def test_registry_refuses_what_does_not_derive_from_its_base(registry):
+    with pytest.raises(ConfigError, match=rf"{registry.kind} 'mine/x': .* derive from ba_torchrl"):
+        registry.register("mine/x")(type("X", (), {}))
+    assert "mine/x" not in registry
 
 
 @pytest.mark.parametrize("name", [object, "", 3, "mine/my task"])

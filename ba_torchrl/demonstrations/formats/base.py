@@ -241,7 +241,7 @@ class Format(ABC):
             ) from error
 
 
-FORMATS: Registry[Format] = Registry("format", "ba_torchrl.demonstrations.formats")
+FORMATS: Registry[Format] = Registry("format", "ba_torchrl.demonstrations.formats", Format)
 
 
 def find_format(path: Path) -> Format | None:

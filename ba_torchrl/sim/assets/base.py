@@ -15,8 +15,6 @@ from ba_torchrl.sim.assets.hulls import volume_and_center
 from ba_torchrl.sim.meshes import Mesh, transform_mesh
 from ba_torchrl.sim.shapes import Color, Solid
 
-OBJECT_SETS: Registry[type[ObjectSet]] = Registry("object set", "ba_torchrl.sim.assets")
-
 PALETTE: tuple[Color, ...] = (
     (0.84, 0.31, 0.25, 1.0),
     (0.25, 0.48, 0.76, 1.0),
@@ -82,6 +80,9 @@ class ObjectSet(Sequence[Solid], ABC):
                 color=PALETTE[index % len(PALETTE)],
             )
         return self._shapes[index]
+
+
+OBJECT_SETS: Registry[type[ObjectSet]] = Registry("object set", "ba_torchrl.sim.assets", ObjectSet)
 
 
 def load_object_set(name: str, asset_root: str | None = None) -> ObjectSet:

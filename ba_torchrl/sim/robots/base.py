@@ -29,8 +29,6 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.gripper import TIP_HEIGHT_M, Gripper
 from ba_torchrl.sim.world import World
 
-ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots")
-
 GRASP_NORMAL_COSINE = 0.7
 """A contact contributes to a grasp if its normal is within 45 degrees of the closing axis."""
 OPPOSED_COSINE = 0.8
@@ -382,6 +380,9 @@ class Robot(ABC):
             for a in left
             for b in right
         )
+
+
+ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots", Robot)
 
 
 REST_JOINT_RAD = 1e-3

@@ -44,8 +44,6 @@ from ba_torchrl.sim.vision.lens import Lens, Range, oblique_lens, side_lenses
 from ba_torchrl.sim.vision.rgb import render_rgbd
 from ba_torchrl.sim.world import World
 
-VIEWS: Registry[View] = Registry("view type", "ba_torchrl.sim")
-
 MAX_RECESS_M = 0.02
 """Depth of the recesses that represent goal areas."""
 FIXED_CAMERA_CLEARANCE_M = 0.04
@@ -159,6 +157,9 @@ class View(ABC):
     @abstractmethod
     def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [C, H, W] float64."""
+
+
+VIEWS: Registry[View] = Registry("view type", "ba_torchrl.sim", View)
 
 
 @dataclass(frozen=True)

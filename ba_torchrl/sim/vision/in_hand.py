@@ -16,8 +16,6 @@ from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.geometry import euler_matrix
 from ba_torchrl.sim.vision.kernels import project
 
-IN_HAND_MODES: Registry[type[InHandImage]] = Registry("in_hand_mode", "ba_torchrl.sim")
-
 
 class PickView(NamedTuple):
     """Heightmaps before and after a pick, and the pose of the tool at the grasp."""
@@ -46,6 +44,9 @@ class InHandImage(ABC):
     @abstractmethod
     def draw(self, view: PickView, size: int) -> np.ndarray:
         """Return the in-hand image of a pick, [channels, size, size] float64."""
+
+
+IN_HAND_MODES: Registry[type[InHandImage]] = Registry("in_hand_mode", "ba_torchrl.sim", InHandImage)
 
 
 @IN_HAND_MODES.register("raw")

@@ -96,5 +96,5 @@ class CollectorConfig(StrictModel, ABC):
 
 
 COLLECTORS: Registry[type[CollectorConfig]] = Registry(
-    "collector", "ba_torchrl.training.collectors"
+    "collector", "ba_torchrl.training.collectors", CollectorConfig
 )
