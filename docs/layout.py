@@ -43,7 +43,7 @@ SUBJECTS = (
     Subject("SACfD", ("algorithms.sac.SACConfig",), ("algorithms", "objectives"), 1800),
     Subject(
         "SDQfD with Equi ASR",
-        ("algorithms.spatial_q.SpatialQConfig", "modules.spatial.equi_asr.EquivariantASRConfig"),
+        ("algorithms.spatial_q.SpatialQConfig", "modules.spatial.equi_asr.EquiASRConfig"),
         ("algorithms", "objectives", "modules.spatial"),
         1800,
     ),

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from typing_extensions import Self
 
 from ba_torchrl.core.errors import PlacementError
-from ba_torchrl.sim.geometry import PlanarFrame, Vector
+from ba_torchrl.sim.geometry import Vector
 
 LAYOUT_ATTEMPTS = 2000
 """Random layouts before a `PlacementError`; bowl and block fit in about one of ten."""
@@ -79,29 +80,36 @@ class Spacing(NamedTuple):
     """Least distance between its centre and those of the objects placed before it."""
 
 
-class Area(NamedTuple):
+@dataclass(frozen=True)
+class Area:
     """An axis-aligned rectangle of the horizontal plane, metres."""
 
     x: tuple[float, float]
     y: tuple[float, float]
 
     @property
-    def heading_rad(self) -> None:
-        """None: pieces may have any yaw."""
+    def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
+        """The ranges of x and y."""
+        return self.x, self.y
+
+    @property
+    def heading_rad(self) -> float | None:
+        """Heading of an area that is only a line; None: pieces may have any yaw."""
         return None
 
     def outside_m(self, points: np.ndarray) -> np.ndarray:
         """Return how far points [N, 2] are outside of the area, along x or along y, [N]."""
-        low, high = np.array([self.x, self.y]).T
+        low, high = np.array(self.bounds).T
         return np.maximum(np.maximum(low - points, points - high), 0.0).max(axis=1)
 
     def sites(self) -> np.ndarray:
         """Return a grid of points [S, 2]."""
-        return np.array([(a, b) for a in _grid(*self.x) for b in _grid(*self.y)])
+        return np.array([(a, b) for a in spaced(*self.x) for b in spaced(*self.y)])
 
-    def shrunk(self, border_m: float) -> Area:
+    def shrunk(self, border_m: float) -> Self:
         """Return the area less a border of this width."""
-        return Area(*((low + border_m, high - border_m) for low, high in self))
+        x, y = ((low + border_m, high - border_m) for low, high in self.bounds)
+        return replace(self, x=x, y=y)
 
     def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
         """Return a uniformly random point at least half of ``padding_m`` from the border.
@@ -110,87 +118,26 @@ class Area(NamedTuple):
             PlacementError: the area is smaller than the padding.
         """
         point = []
-        for low, high in self:
+        for low, high in self.bounds:
             low, high = low + padding_m / 2, high - padding_m / 2
             if low >= high:
-                raise PlacementError(
-                    f"an object that keeps {padding_m / 2:.3f} m from the border does not fit: "
-                    "enlarge `workspace` or lower `object_scale_range`"
-                )
+                raise no_room(padding_m)
             point.append(float(rng.uniform(low, high)))
         return tuple(point)
 
 
-class OrientedArea(NamedTuple):
-    """A rectangle at any heading, cut off at the borders of an axis-aligned one.
-
-    Shrunk by more than half its width, it is the line along its centre.
-    """
-
-    frame: PlanarFrame
-    """Centre and heading."""
-    half_x: float
-    half_y: float
-    within: Area
-    """The points of the rectangle outside of it do not belong to the area."""
-
-    @property
-    def heading_rad(self) -> float | None:
-        """Heading of an area that is only a line; None for a wider one."""
-        return None if self.half_y else self.frame.yaw_rad
-
-    def shrunk(self, border_m: float) -> OrientedArea:
-        """Return the area less a border of this width."""
-        return self._replace(
-            half_x=max(self.half_x - border_m, 0.0),
-            half_y=max(self.half_y - border_m, 0.0),
-            within=self.within.shrunk(border_m),
-        )
-
-    def outside_m(self, points: np.ndarray) -> np.ndarray:
-        """Return how far points [N, 2] are outside of the area, along one of the axes, [N]."""
-        along, across = self.frame.to_local(*points.T)
-        outside = np.maximum(np.abs(along) - self.half_x, np.abs(across) - self.half_y)
-        return np.maximum(np.maximum(outside, 0.0), self.within.outside_m(points))
-
-    def sites(self) -> np.ndarray:
-        """Return a grid of points [S, 2], parallel to the rectangle."""
-        grid = np.array(
-            [
-                self.frame.to_world(a, b)
-                for a in _grid(-self.half_x, self.half_x)
-                for b in _grid(-self.half_y, self.half_y)
-            ]
-        )
-        inside = self.within.outside_m(grid) == 0
-        return grid[inside] if inside.any() else grid
-
-    def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
-        """Return a uniformly random point at least half of ``padding_m`` from the border.
-
-        Raises:
-            PlacementError: no point was found.
-        """
-        area = self.shrunk(padding_m / 2)
-        for _ in range(LAYOUT_ATTEMPTS):
-            local = (float(rng.uniform(-half, half)) for half in (area.half_x, area.half_y))
-            point = area.frame.to_world(*local)
-            if not area.within.outside_m(np.array([point])).any():
-                return point
-        raise PlacementError(
-            f"an object that keeps {padding_m / 2:.3f} m from the border does not fit: enlarge "
-            "`workspace` or lower `object_scale_range`"
-        )
-
-
-Region = Area | OrientedArea
-"""A convex part of the horizontal plane."""
+def no_room(padding_m: float) -> PlacementError:
+    """Return the error of an area that is smaller than a padding."""
+    return PlacementError(
+        f"an object that keeps {padding_m / 2:.3f} m from the border does not fit: enlarge "
+        "`workspace` or lower `object_scale_range`"
+    )
 
 
 def random_points(
-    region: Region, rng: np.random.Generator, spacings: Sequence[Spacing]
+    area: Area, rng: np.random.Generator, spacings: Sequence[Spacing]
 ) -> list[tuple[float, float]]:
-    """Return uniformly random points of a region, one for each object, that keep their distances.
+    """Return uniformly random points of an area, one for each object, that keep their distances.
 
     Raises:
         PlacementError: no layout was found.
@@ -198,7 +145,7 @@ def random_points(
     for _ in range(LAYOUT_ATTEMPTS):
         points: list[tuple[float, float]] = []
         for spacing in spacings:
-            point = region.random_point(rng, spacing.padding_m)
+            point = area.random_point(rng, spacing.padding_m)
             if any(math.dist(point, other) < spacing.distance_m for other in points):
                 break
             points.append(point)
@@ -210,6 +157,7 @@ def random_points(
     )
 
 
-def _grid(low: float, high: float) -> list[float]:
+def spaced(low: float, high: float) -> list[float]:
+    """Return evenly spaced numbers from low to high, about `SITE_STEP_M` apart."""
     count = max(1, round((high - low) / SITE_STEP_M))
     return [low + (high - low) * i / count for i in range(count + 1)]

@@ -1,19 +1,21 @@
 """Regions of the ground: axis-aligned and oriented rectangles."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.sim.geometry import PlanarFrame
-from ba_torchrl.tasks.workspace import Area, OrientedArea
+from ba_torchrl.tasks.terrain.sloped import OrientedArea
+from ba_torchrl.tasks.workspace import Area
 
 AREA = Area((0.2, 0.6), (-0.1, 0.3))
 
 
 def oriented(half_x=0.3, half_y=0.03, heading=0.5):
-    return OrientedArea(PlanarFrame(0.4, 0.1, heading), half_x, half_y, AREA)
+    return OrientedArea(*AREA.bounds, PlanarFrame(0.4, 0.1, heading), half_x, half_y)
 
 
 def test_points_outside_of_an_area_have_a_distance():
@@ -46,6 +48,6 @@ def test_an_area_narrower_than_the_border_is_the_line_along_its_centre():
 
 
 def test_an_oriented_area_outside_of_its_limits_has_no_points():
-    area = oriented()._replace(frame=PlanarFrame(2.0, 2.0, 0.0), half_x=0.1)
+    area = replace(oriented(), frame=PlanarFrame(2.0, 2.0, 0.0), half_x=0.1)
     with pytest.raises(PlacementError, match="enlarge"):
         area.random_point(np.random.default_rng(0))

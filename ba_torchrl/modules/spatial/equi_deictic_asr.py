@@ -8,7 +8,7 @@ from ba_torchrl.modules.spatial.asr import ASR
 from ba_torchrl.modules.spatial.base import SpatialSpec
 from ba_torchrl.modules.spatial.equi_asr import (
     SCENE_COPIES,
-    EquivariantASRConfig,
+    EquiASRConfig,
     SceneVector,
 )
 from ba_torchrl.modules.spatial.pose_values import FingerSymmetricValues, PoseValues, SceneMapVector
@@ -22,7 +22,7 @@ from ba_torchrl.modules.spatial.pose_views import (
 
 
 @NETWORKS.register("equi_deictic_asr")
-class EquiDeicticASRConfig(EquivariantASRConfig, PoseGridConfig):
+class EquiDeicticASRConfig(EquiASRConfig, PoseGridConfig):
     """Hyper-parameters of the network that sees the scene from every candidate pose.
 
     Pixels and yaws are chosen by the equivariant networks of 'equi_asr'. Each z, ry and rx is
@@ -65,7 +65,7 @@ class EquiDeicticASRConfig(EquivariantASRConfig, PoseGridConfig):
             scene = (
                 SceneMapVector(channels, spec.image_size, self, copies=SCENE_COPIES)
                 if self.scene_head == "flatten"
-                else SceneVector("pool", channels, spec.image_size, self)
+                else SceneVector(channels, spec.image_size, self)
             )
             values = PoseValues(spec, in_voxels, view.channels, 1, patch_size, scene)
             if self.swap_fingers and spec.half_rotation:

@@ -88,13 +88,17 @@ def _spaced(first: float, last: float, count: int) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True)
-class UprightView:
-    """Projections at the chosen pixel and yaw: at the chosen z, or at every z if none is chosen."""
+class _PoseView:
+    """Projections of the patch of ``size`` pixels around the chosen pixel."""
 
     grid: PoseGrid
     pixel_m: float
     size: int
     channels: ClassVar[int] = 3
+
+
+class UprightView(_PoseView):
+    """Projections at the chosen pixel and yaw: at the chosen z, or at every z if none is chosen."""
 
     def __call__(self, heightmap: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, K, 3, p, p], voxels."""
@@ -107,19 +111,12 @@ class UprightView:
         return project_upright(patch, self.pixel_m, z, yaws[chosen[:, 2]])
 
 
-@dataclass(frozen=True)
-class TiltedView:
+class TiltedView(_PoseView):
     """Projections at the chosen pixel, yaw and z: at the chosen ry, or at every ry if none is
     chosen, with every rx.
 
-    Args:
-        grid: values of the components; a single rx of zero for views before rx is chosen.
+    The grid has a single rx of zero for views before rx is chosen.
     """
-
-    grid: PoseGrid
-    pixel_m: float
-    size: int
-    channels: ClassVar[int] = 3
 
     def __call__(self, heightmap: Tensor, chosen: Tensor) -> Tensor:
         """Return projections [B, K, 3, p, p], voxels; ry is the outer index of the poses."""

@@ -13,8 +13,14 @@ from ba_torchrl.sim.contacts import gap_m
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import BLUE, RED, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
-from ba_torchrl.tasks.manipulation.progress_terms import nearness, reach_behind, staged
-from ba_torchrl.tasks.manipulation.pushing import STANDOFF_M, Push, behind_point, has_room_behind
+from ba_torchrl.tasks.manipulation.progress_terms import nearness, staged
+from ba_torchrl.tasks.manipulation.pushing import (
+    STANDOFF_M,
+    Push,
+    behind_point,
+    has_room_behind,
+    reach_behind,
+)
 
 NO_ROOM_COST_M = 1.0
 """Cost of a block with no room behind it for the gripper."""

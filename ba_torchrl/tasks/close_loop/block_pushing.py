@@ -14,8 +14,8 @@ from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.tasks.base import BLOCK_M, GREEN, TASKS, CloseLoopTask
 from ba_torchrl.tasks.instructions import colored
-from ba_torchrl.tasks.manipulation.progress_terms import nearness, reach_behind, staged
-from ba_torchrl.tasks.manipulation.pushing import Push
+from ba_torchrl.tasks.manipulation.progress_terms import nearness, staged
+from ba_torchrl.tasks.manipulation.pushing import Push, reach_behind
 
 
 @TASKS.register("close_loop/block_pushing")

@@ -8,13 +8,6 @@ from collections.abc import Iterable
 from ba_torchrl.core.actions import wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.manipulation.pushing import (
-    PUSH_HEIGHT_M,
-    PUSH_HEIGHT_TOLERANCE_M,
-    behind_point,
-    distance_to_segment,
-)
-from ba_torchrl.tasks.workspace import Workspace
 
 MOST = 0.9
 """Progress of a state in which all stages are complete; a success has the reward 1."""
@@ -70,23 +63,3 @@ def reach(
 def lift_height(robot: Robot, low_m: float, high_m: float) -> float:
     """Return the height of the tool as a part of the way from ``low_m`` to ``high_m``."""
     return share(robot.tool_pose()[0][2], low_m, high_m)
-
-
-def reach_behind(
-    robot: Robot, body: Body, goal: tuple[float, float], workspace: Workspace
-) -> float:
-    """Return the nearness of the tool to where it pushes a body straight to a goal.
-
-    That is the line from the point of `behind_point` to the surface of the body, at the height and
-    with the yaw of a push.
-    """
-    bx, by, _ = body.position
-    length = math.dist((bx, by), goal)
-    ux, uy = ((goal[0] - bx) / length, (goal[1] - by) / length) if length > 1e-6 else (1.0, 0.0)
-    half = min(body.shape.bounds_m[1][:2])
-    (x, y, z), _ = robot.tool_pose()
-    behind = behind_point(robot, body, (ux, uy), workspace)
-    aside_m = distance_to_segment((x, y), behind, (bx - half * ux, by - half * uy))
-    above_m = max(z - workspace.z[0] - PUSH_HEIGHT_M - PUSH_HEIGHT_TOLERANCE_M, 0.0)
-    across = math.atan2(uy, ux) + math.pi / 2
-    return nearness(math.hypot(aside_m, above_m) + turn_m(robot, [across]))

@@ -26,6 +26,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
     nearest_equivalent_yaw,
 )
+from ba_torchrl.tasks.manipulation.progress_terms import nearness, turn_m
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 PUSH_HEIGHT_M = 0.02
@@ -92,11 +93,7 @@ class Push:
         self.workspace, self.limits = workspace, limits
         self.opening, self.stop_short_m = opening, stop_short_m
         self.position, self.yaw_rad = robot.tool_pose()
-        bx, by, bz = body.position
-        self.length_m = math.dist((bx, by), goal)
-        self.direction = (1.0, 0.0)
-        if self.length_m > 1e-6:
-            self.direction = ((goal[0] - bx) / self.length_m, (goal[1] - by) / self.length_m)
+        self.length_m, self.direction = push_line(body, goal)
         self.behind = behind_point(robot, body, self.direction, workspace)
         self.has_room = has_room_behind(robot, body, self.behind)
         self.held = grasped_body(robot)
@@ -104,7 +101,7 @@ class Push:
         self.target_yaw_rad = nearest_equivalent_yaw(self.yaw_rad, across, limits, math.pi)
         self.turn_rad = abs(wrap_angle(self.target_yaw_rad - self.yaw_rad))
         self.low_m = workspace.z[0] + PUSH_HEIGHT_M
-        self.top_m = bz + body.shape.height_m / 2
+        self.top_m = body.position[2] + body.shape.height_m / 2
         self.over_m = self.top_m + passing_height_m(robot.gripper)
 
     def command(self) -> GripperCommand:
@@ -196,6 +193,33 @@ class Push:
     def _is_around(self) -> bool:
         """Whether the fingers may be around the body."""
         return math.dist(self.position[:2], self.body.position[:2]) < footprint_radius_m(self.body)
+
+
+def push_line(body: Body, goal: tuple[float, float]) -> tuple[float, tuple[float, float]]:
+    """Return the distance of a goal from a body, and the unit vector to it."""
+    bx, by, _ = body.position
+    length_m = math.dist((bx, by), goal)
+    if length_m <= 1e-6:
+        return length_m, (1.0, 0.0)
+    return length_m, ((goal[0] - bx) / length_m, (goal[1] - by) / length_m)
+
+
+def reach_behind(
+    robot: Robot, body: Body, goal: tuple[float, float], workspace: Workspace
+) -> float:
+    """Return the nearness of the tool to where it pushes a body straight to a goal.
+
+    That is the line from the point of `behind_point` to the surface of the body, at the height and
+    with the yaw of a push.
+    """
+    (bx, by, _), (_, (ux, uy)) = body.position, push_line(body, goal)
+    half = min(body.shape.bounds_m[1][:2])
+    (x, y, z), _ = robot.tool_pose()
+    behind = behind_point(robot, body, (ux, uy), workspace)
+    aside_m = distance_to_segment((x, y), behind, (bx - half * ux, by - half * uy))
+    above_m = max(z - workspace.z[0] - PUSH_HEIGHT_M - PUSH_HEIGHT_TOLERANCE_M, 0.0)
+    across = math.atan2(uy, ux) + math.pi / 2
+    return nearness(math.hypot(aside_m, above_m) + turn_m(robot, [across]))
 
 
 def behind_point(

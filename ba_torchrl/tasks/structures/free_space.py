@@ -9,16 +9,16 @@ import numpy as np
 
 from ba_torchrl.sim.bodies import Body, footprint_radius_m, world_vertices
 from ba_torchrl.tasks.terrain.flat import Terrain
-from ba_torchrl.tasks.workspace import Region
+from ba_torchrl.tasks.workspace import Area
 
 
 class PlacementArea(NamedTuple):
     """The parts of the ground where pieces may be placed."""
 
     terrain: Terrain
-    building: Region
+    building: Area
     """Where structures stand."""
-    aside: Region
+    aside: Area
     """Where other pieces are placed."""
     gap_m: float
     """Gap wanted between the bounding circles of two pieces."""

@@ -17,8 +17,8 @@ from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
-from ba_torchrl.tasks.terrain.sloped import SlopedTerrain
-from ba_torchrl.tasks.workspace import OrientedArea, Spacing, Workspace
+from ba_torchrl.tasks.terrain.sloped import OrientedArea, SlopedTerrain
+from ba_torchrl.tasks.workspace import Spacing, Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
 """Range of the slope of a pyramid."""
@@ -111,7 +111,7 @@ class Bumps(SlopedTerrain):
     def build_area(self) -> OrientedArea:
         """The platform."""
         half_x, half_y = (size / 2 for size in self.platform_m)
-        return OrientedArea(self.layout.platform, half_x, half_y, self.spawn_area)
+        return OrientedArea(*self.spawn_area.bounds, self.layout.platform, half_x, half_y)
 
     @property
     def goal_frame(self) -> PlanarFrame:
@@ -126,7 +126,7 @@ class Bumps(SlopedTerrain):
         half_x, half_y = (size / 2 for size in self.platform_m)
         extents = Rectangle(0.0, 0.0, yaw, half_x, half_y).extents_m(0.0)
         center = []
-        for (low, high), extent in zip(self.spawn_area, extents, strict=True):
+        for (low, high), extent in zip(self.spawn_area.bounds, extents, strict=True):
             if low + extent > high - extent:
                 raise PlacementError(
                     f"the platform of {2 * half_x:.3g} m by {2 * half_y:.3g} m does not fit: "

@@ -16,7 +16,7 @@ from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import Matrix, PlanarFrame, Pose, yaw_quaternion
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.workspace import Area, Region, Spacing, Workspace, random_points
+from ba_torchrl.tasks.workspace import Area, Spacing, Workspace, random_points
 
 
 class Terrain(ABC):
@@ -55,12 +55,12 @@ class Terrain(ABC):
         return Area(self.workspace.x, self.workspace.y)
 
     @property
-    def build_area(self) -> Region:
+    def build_area(self) -> Area:
         """The area where experts build structures on the ground."""
         return Area(self.workspace.x, self.workspace.y)
 
     @property
-    def aside_area(self) -> Region:
+    def aside_area(self) -> Area:
         """The area where experts place other objects on the ground."""
         return self.build_area
 

@@ -13,8 +13,8 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame, Pose, quaternion_product, yaw_quaternion
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.terrain.sloped import SlopedTerrain, footprint
-from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, OrientedArea, Workspace
+from ba_torchrl.tasks.terrain.sloped import OrientedArea, SlopedTerrain, footprint
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Workspace
 
 GAP_M = (0.04, 0.2)
 """Range of the distance between the ramps."""
@@ -62,7 +62,7 @@ class Ramps(SlopedTerrain):
 
     def __init__(self, world: World, workspace: Workspace) -> None:
         super().__init__(world, workspace)
-        radius_m = math.hypot(*(high - low for low, high in self.spawn_area)) / 2 + BORDER_M
+        radius_m = math.hypot(*(high - low for low, high in self.spawn_area.bounds)) / 2 + BORDER_M
         length_m = radius_m / math.cos(SLOPE_RAD[1])
         self.size_m = (2 * radius_m, length_m, length_m * math.tan(SLOPE_RAD[1]) + BORDER_M)
         """Extents of a ramp along its edge, up the slope and perpendicular to it."""
@@ -92,7 +92,7 @@ class Ramps(SlopedTerrain):
         offset, half = (first - second) / 2, (first + second) / 2
         center = self.frame.to_world(0.0, offset)
         frame = PlanarFrame(*center, self.layout.heading_rad)
-        return OrientedArea(frame, self.size_m[0] / 2, half, self.spawn_area)
+        return OrientedArea(*self.spawn_area.bounds, frame, self.size_m[0] / 2, half)
 
     def reserve(self, width_m: float) -> None:
         """Leave a gap between the ramps of the next episodes in which such a piece can be grasped.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -23,7 +24,7 @@ from ba_torchrl.sim.geometry import (
 )
 from ba_torchrl.sim.robots.gripper import FLOOR_CLEARANCE_M, Gripper
 from ba_torchrl.tasks.terrain.flat import Terrain
-from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, Spacing
+from ba_torchrl.tasks.workspace import LAYOUT_ATTEMPTS, Area, Spacing, no_room, spaced
 
 PROBE_M = 1e-4
 """Distance at which the slope at a point is measured."""
@@ -48,6 +49,58 @@ SHARE_TOLERANCE = 1e-12
 _BEARINGS = 2 * math.pi * np.arange(16) / 16
 _RING = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS)], axis=1)
 """[16, 2] points of the unit circle."""
+
+
+@dataclass(frozen=True)
+class OrientedArea(Area):
+    """The part of an axis-aligned area in a rectangle at any heading.
+
+    Shrunk by more than half its width, it is the line along its centre.
+    """
+
+    frame: PlanarFrame
+    """Centre and heading of the rectangle."""
+    half_x: float
+    half_y: float
+
+    @property
+    def heading_rad(self) -> float | None:
+        """Heading of an area that is only a line; None for a wider one."""
+        return None if self.half_y else self.frame.yaw_rad
+
+    def shrunk(self, border_m: float) -> OrientedArea:
+        """Return the area less a border of this width."""
+        halves = {"half_x": self.half_x, "half_y": self.half_y}
+        smaller = {name: max(half - border_m, 0.0) for name, half in halves.items()}
+        return replace(super().shrunk(border_m), **smaller)
+
+    def outside_m(self, points: np.ndarray) -> np.ndarray:
+        """Return how far points [N, 2] are outside of the area, along one of the axes, [N]."""
+        along, across = self.frame.to_local(*points.T)
+        outside = np.maximum(np.abs(along) - self.half_x, np.abs(across) - self.half_y)
+        return np.maximum(np.maximum(outside, 0.0), super().outside_m(points))
+
+    def sites(self) -> np.ndarray:
+        """Return a grid of points [S, 2], parallel to the rectangle."""
+        points = np.array(
+            [
+                self.frame.to_world(a, b)
+                for a in spaced(-self.half_x, self.half_x)
+                for b in spaced(-self.half_y, self.half_y)
+            ]
+        )
+        inside = super().outside_m(points) == 0
+        return points[inside] if inside.any() else points
+
+    def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
+        """Return a uniformly random point, as `Area`."""
+        area = self.shrunk(padding_m / 2)
+        for _ in range(LAYOUT_ATTEMPTS):
+            local = (float(rng.uniform(-half, half)) for half in (area.half_x, area.half_y))
+            point = area.frame.to_world(*local)
+            if not super(OrientedArea, area).outside_m(np.array([point])).any():
+                return point
+        raise no_room(padding_m)
 
 
 class SlopedTerrain(Terrain):

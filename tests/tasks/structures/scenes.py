@@ -18,7 +18,7 @@ from ba_torchrl.tasks.workspace import Area, Workspace
 B = 0.03
 SPAN = Span(1.5 * B, 1.75 * B, 2.2 * B)
 REGION = Area((0.3, 0.6), (-0.15, 0.15))
-AREA = PlacementArea(Flat(None, Workspace(*REGION, (0.0, 0.4))), REGION, REGION, gap_m=B)
+AREA = PlacementArea(Flat(None, Workspace(*REGION.bounds, (0.0, 0.4))), REGION, REGION, gap_m=B)
 SHAPES = {
     "cube": Box(size_m=(B, B, B)),
     "cuboid": Box(size_m=(B, 4 * B, B)),
