@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,9 +24,8 @@ SUPPORT_COSINE = 0.5
 
 
 class PieceState(NamedTuple):
-    """Position, tilt and supports of a piece."""
+    """Tilt and supports of a piece."""
 
-    position: Vector
     tilt_rad: float
     on_ground: bool
     """Whether it touches the ground."""
@@ -69,7 +69,6 @@ def read_piece_states(
             if other is not None and heights[body] - heights[other] >= block_m / 2:
                 supports.add(other)
         states[body] = PieceState(
-            body.position,
             piece.tilt_rad(body),
             not ground.isdisjoint(touched),
             not base.isdisjoint(below),
@@ -78,27 +77,17 @@ def read_piece_states(
     return states
 
 
+@dataclass(frozen=True)
 class SlotAssigner:
-    """Finds the assignments of the pieces, in their present states, to the slots of a blueprint.
+    """Finds the assignments of the pieces, in their present states, to the slots of a blueprint."""
 
-    Args:
-        block_m: edge of a block, which bounds how far a piece may be off the centre of its slot.
-        held: the body in the gripper; it fills no slot.
-    """
-
-    def __init__(
-        self,
-        blueprint: Blueprint,
-        pieces: Mapping[Body, Piece],
-        states: Mapping[Body, PieceState],
-        block_m: float,
-        held: Body | None,
-    ) -> None:
-        self.blueprint = blueprint
-        self.pieces = pieces
-        self.states = states
-        self.block_m = block_m
-        self.held = held
+    blueprint: Blueprint
+    pieces: Mapping[Body, Piece]
+    states: Mapping[Body, PieceState]
+    block_m: float
+    """Edge of a block, which bounds how far a piece may be off the centre of its slot."""
+    held: Body | None
+    """The body in the gripper; it fills no slot."""
 
     def evaluate(self) -> dict[str, bool]:
         """Return whether the structure stands and whether no piece is held."""
@@ -172,37 +161,35 @@ class SlotAssigner:
         supports = [assignment[i] for i in slot.on]
         if state.tilt_rad >= UPRIGHT_RAD:
             return False
-        partner = self.blueprint.partner(number)
+        bridge, partner = self.blueprint.bridge_on(number)
         if supports:
             if state.on_ground or not state.supports.issuperset(supports):
                 return False
         elif not state.on_base or state.supports:
             return False
-        if partner is not None:
-            return partner > number or self._is_pair(body, number, partner, assignment)
+        if bridge is not None:
+            return partner > number or self._is_pair(body, assignment[partner], bridge, supports)
         if not supports:
             return True
         below = [assignment[i] for i in slot.centered_over or slot.on]
         if None in below:
             return False
-        center = mean_position(self.states[other].position for other in below)
-        dx, dy = (state.position[i] - center[i] for i in (0, 1))
+        center = mean_position(other.position for other in below)
+        dx, dy = (body.position[i] - center[i] for i in (0, 1))
         if len(below) == 1:
             return max(abs(dx), abs(dy)) <= self.block_m / 2
         return math.hypot(dx, dy) < self.block_m
 
-    def _is_pair(self, body: Body, number: int, partner: int, assignment: Assignment) -> bool:
-        """Whether a body and the body in the partner slot are where they can support a bridge."""
-        other = assignment[partner]
+    def _is_pair(
+        self, body: Body, other: Body | None, bridge: Slot, supports: Sequence[Body]
+    ) -> bool:
+        """Whether two bodies, on the same supports, are where they can support a bridge."""
         if other is None:
             return False
-        on = self.blueprint.slots[number].on
-        first, second = self.states[body].position, self.states[other].position
-        if on:
-            support = self.states[assignment[on[0]]].position
-            if math.dist(mean_position((first, second))[:2], support[:2]) >= self.block_m:
+        if supports:
+            middle = mean_position((body.position, other.position))
+            if math.dist(middle[:2], supports[0].position[:2]) >= self.block_m:
                 return False
-        bridge = self.blueprint.slots[self.blueprint.bridge_on(number)]
         if self.span_error_m(bridge, body, other) == 0:
             return True
         return any(
@@ -213,7 +200,7 @@ class SlotAssigner:
 
     def span_error_m(self, bridge: Slot, body: Body, other: Body) -> float:
         """Return by how much the distance of two pieces is outside the span of a bridge."""
-        first, second = self.states[body].position, self.states[other].position
+        first, second = body.position, other.position
         distance = math.dist(first[:2], second[:2])
         if bridge.span.gap_m is not None:
             direction = (np.array(second[:2]) - first[:2]) / max(distance, 1e-9)

@@ -116,20 +116,15 @@ class Blueprint:
             if slot.span is not None and self.slots[slot.on[0]].on != self.slots[slot.on[1]].on:
                 raise ValueError(f"slot {number}: its two supports must rest on the same slots")
 
-    def bridge_on(self, number: int) -> int | None:
-        """Return the number of the bridge that a slot supports; None if it supports no bridge."""
-        for bridge, slot in enumerate(self.slots):
-            if len(slot.on) == 2 and number in slot.on:
-                return bridge
-        return None
+    def bridge_on(self, number: int) -> tuple[Slot | None, int | None]:
+        """Return the bridge that a slot supports, and the number of its other support.
 
-    def partner(self, number: int) -> int | None:
-        """Return the number of the slot that supports the same bridge; None without a bridge."""
-        bridge = self.bridge_on(number)
-        if bridge is None:
-            return None
-        first, second = self.slots[bridge].on
-        return second if number == first else first
+        Both are None if the slot supports no bridge.
+        """
+        for slot in self.slots:
+            if len(slot.on) == 2 and number in slot.on:
+                return slot, sum(slot.on) - number
+        return None, None
 
 
 def tower(*pieces: Piece) -> Blueprint:

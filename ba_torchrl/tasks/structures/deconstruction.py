@@ -29,6 +29,7 @@ from ba_torchrl.tasks.manipulation.footprints import extents_m, separation_m
 from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, pick_command, place_command
 from ba_torchrl.tasks.structures.assignment import mean_position
 from ba_torchrl.tasks.structures.blueprint import Slot
+from ba_torchrl.tasks.structures.bridges import bridge_yaw_rad
 from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
 from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
@@ -87,12 +88,11 @@ class Deconstruction(OpenLoopTask):
             bodies.append(candidates[rng.integers(len(candidates))])
             unused.remove(bodies[-1])
         # slots on the ground; of two supports of a bridge the first
-        on_ground = [
-            i
-            for i, slot in enumerate(slots)
-            if not slot.on
-            and (structure.blueprint.partner(i) is None or structure.blueprint.partner(i) > i)
-        ]
+        on_ground = []
+        for i, slot in enumerate(slots):
+            _, partner = structure.blueprint.bridge_on(i)
+            if not slot.on and (partner is None or partner > i):
+                on_ground.append(i)
         width_m = 2 * max(map(footprint_radius_m, bodies)) + self.block_m
         spacings = [Spacing(width_m, width_m)] * len(on_ground)
         points = random_points(self.terrain.build_area, rng, spacings)
@@ -205,7 +205,7 @@ class Deconstruction(OpenLoopTask):
                 bridge, the point between them.
         """
         structure, body = self.task.structure, bodies[number]
-        piece, partner = structure.pieces[body], structure.blueprint.partner(number)
+        piece, (bridge, partner) = structure.pieces[body], structure.blueprint.bridge_on(number)
         supports = [bodies[i] for i in slot.on]
         if partner is not None and partner < number:
             xy = bodies[partner].position[:2]
@@ -217,8 +217,7 @@ class Deconstruction(OpenLoopTask):
         if not supports and self._heading_rad is not None:
             yaw = self._heading_rad + math.pi / 2 - piece.grasp_yaws_rad[0]
         if len(supports) == 2:
-            (ax, ay, _), (bx, by, _) = (support.position for support in supports)
-            yaw = math.atan2(by - ay, bx - ax) - math.pi / 2
+            yaw = bridge_yaw_rad(supports)
         elif supports and slot.inherits_yaw and self.settings.random_orientation:
             yaw = structure.pieces[supports[0]].yaw_rad(supports[0])
         self.task.stand(body, xy, yaw)
@@ -227,17 +226,19 @@ class Deconstruction(OpenLoopTask):
             x, y, z = body.position
             body.place((x, y, z + top - self.terrain.height_m((x, y))), yaw)
         if partner is not None and partner < number:
-            self._separate_pair(number, bodies, rng)
+            self._separate_pair(bridge, supports, [bodies[i] for i in bridge.on], rng)
 
-    def _separate_pair(self, number: int, bodies: Sequence[Body], rng: np.random.Generator) -> None:
-        """Move the two supports of a bridge from their common centre to a random distance."""
+    def _separate_pair(
+        self,
+        bridge: Slot,
+        supports: Sequence[Body],
+        pair: Sequence[Body],
+        rng: np.random.Generator,
+    ) -> None:
+        """Move the two bodies under a bridge from their common centre to a random distance."""
         structure = self.task.structure
-        slots = structure.blueprint.slots
-        bridge = slots[structure.blueprint.bridge_on(number)]
-        pair = [bodies[i] for i in bridge.on]
-        if slots[number].on:  # along the y axis of their own support
-            support = bodies[slots[number].on[0]]
-            yaw = structure.pieces[support].yaw_rad(support)
+        if supports:  # along the y axis of their own support
+            yaw = structure.pieces[supports[0]].yaw_rad(supports[0])
         elif self._heading_rad is not None:
             yaw = self._heading_rad - math.pi / 2
         else:

@@ -58,6 +58,7 @@ class Centred:
     """Middle of the piece along the closing axis, from its origin."""
     along_m: float = 0.0
     """Position of the tool along the length of the piece, from its origin."""
+    is_shifted: ClassVar[bool] = False
 
     @property
     def centering_m(self) -> float:
@@ -92,6 +93,7 @@ class Shifted:
     near_finger_range_m: tuple[float, float]
     """Range in which the near finger descends."""
     centering_m: ClassVar[float] = -1.0
+    is_shifted: ClassVar[bool] = True
 
     @property
     def orientation(self) -> Quaternion:
@@ -201,7 +203,7 @@ class PickPlaceGrasps(Grasps):
         if clearance_m > 0:
             return 0.0
         cost_m = BLOCKED_COST_M - DEFICIT_WEIGHT * deficit_m
-        if _is_shifted(grasp) and deficit_m == 0:
+        if grasp.is_shifted and deficit_m == 0:
             x, y, _ = body.position
             end = PlanarFrame(x, y, grasp.yaw_rad).to_world(PUSHED_M, 0.0)
             ranges = self.terrain.workspace.x, self.terrain.workspace.y
@@ -336,34 +338,27 @@ class PickPlaceGrasps(Grasps):
 
     def _qualities(self, body: Body, grasps: Sequence[Grasp]) -> list[Quality]:
         """Return the quality of each grasp of a body."""
-        others = self.others(body)
+        others, gripper = self.others(body), self.robot.gripper
         limit_m = RAISE_BLOCKS * self.structure.block_m
-        is_raised = [
-            self.limits.can_tilt and self._raise_m(body, grasp) > limit_m for grasp in grasps
+        lower = [
+            grasp
+            for grasp in grasps
+            if not self.limits.can_tilt or self._raise_m(body, grasp) <= limit_m
         ]
-        lower = [grasp for grasp, raised in zip(grasps, is_raised, strict=True) if not raised]
-        clearances_m = iter(self.clearances_m(body, lower, others, None))
-        return [
-            Quality(-1.0, 0.0, -1.0)
-            if raised
-            else self._quality(body, grasp, next(clearances_m), others)
-            for grasp, raised in zip(grasps, is_raised, strict=True)
-        ]
-
-    def _quality(
-        self, body: Body, grasp: Grasp, clearance_m: float, others: Sequence[Body]
-    ) -> Quality:
-        """Return the quality of a grasp from its clearance without the near finger."""
-        least_m = clearance_m
-        if _is_shifted(grasp):
-            near_m = (0.0, 0.0)  # of a tilted tool, the origin of the piece
-            if isinstance(grasp, Shifted):
-                near_m = grasp.near_finger_range_m
-            path_m = path_clearance_m(self.robot.gripper, body, grasp.yaw_rad, (near_m,), others)
-            least_m = min(clearance_m, path_m)
-        if isinstance(grasp, Tilted):  # the largest tilt with enough clearance comes first
-            least_m = min(least_m, SUFFICIENT_CLEARANCE_M)
-        return Quality(min(clearance_m, 0.0), grasp.centering_m, least_m)
+        qualities = dict.fromkeys(grasps, Quality(-1.0, 0.0, -1.0))  # those that are raised more
+        clearances_m = self.clearances_m(body, lower, others, None)
+        for grasp, clearance_m in zip(lower, clearances_m, strict=True):
+            least_m = clearance_m
+            if grasp.is_shifted:
+                near_m = (0.0, 0.0)  # of a tilted tool, the origin of the piece
+                if isinstance(grasp, Shifted):
+                    near_m = grasp.near_finger_range_m
+                path_m = path_clearance_m(gripper, body, grasp.yaw_rad, (near_m,), others)
+                least_m = min(clearance_m, path_m)
+            if isinstance(grasp, Tilted):  # the largest tilt with enough clearance comes first
+                least_m = min(least_m, SUFFICIENT_CLEARANCE_M)
+            qualities[grasp] = Quality(min(clearance_m, 0.0), grasp.centering_m, least_m)
+        return [qualities[grasp] for grasp in grasps]
 
     def tool_pose(self, body: Body, grasp: Grasp) -> Pose:
         """Return the pose of the tool for a grasp, raised so that the fingers clear the ground."""
@@ -467,10 +462,6 @@ def edge_grasps(
             near_finger_range_m = (-near_m - EDGE_CLEARANCE_M - finger_m, -near_m)
             grasps.append(Shifted(yaw, shift_m, far_finger_range_m, near_finger_range_m))
     return grasps
-
-
-def _is_shifted(grasp: Grasp) -> bool:
-    return isinstance(grasp, Shifted) or (isinstance(grasp, Tilted) and grasp.is_shifted)
 
 
 def _middle_m(body: Body, tool: float | Quaternion) -> float:

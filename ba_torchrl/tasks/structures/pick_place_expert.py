@@ -21,7 +21,6 @@ from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.grasps import SUFFICIENT_CLEARANCE_M, PickPlaceGrasps, Tilted
 from ba_torchrl.tasks.structures.moves import Move
 from ba_torchrl.tasks.structures.planner import next_move
-from ba_torchrl.tasks.structures.repair import piece_to_pick
 from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
 
 RELEASE_YAWS = 8
@@ -48,7 +47,7 @@ class PickPlaceExpert:
             return no_op(self.terrain.workspace, held is not None)
         if move.body is held:
             return self._place(move)
-        body = piece_to_pick(move.body, self.grasps)
+        body = self._piece_to_pick(move.body)
         if self.limits.turn_rad and not self.grasps.is_free(body):
             grasp = self.grasps.attempt(body)
             if isinstance(grasp, Tilted):  # straight down, the arm reaches it with any deviation
@@ -56,6 +55,25 @@ class PickPlaceExpert:
             tool = self.grasps.tool_pose(body, grasp)
             return perturbed_pick(self.structure.world, body, tool, self.limits)
         return self.pick(body)
+
+    def _piece_to_pick(self, body: Body) -> Body:
+        """Return the piece to pick so that a body can be picked.
+
+        This is the body itself if it has a grasp with clearance, else a piece outside of the
+        structure that blocks its grasps and has one. A gripper that cannot turn pushes them.
+        """
+        grasps = self.grasps
+        if not self.limits.turn_rad or grasps.is_free(body):
+            return body
+        placed = self.structure.assigner(None).placed()
+        blocking = (
+            other
+            for other in grasps.others(body)
+            if other not in placed
+            and all(grasps.blocks_grasp(body, other, None))
+            and grasps.is_free(other)
+        )
+        return next(blocking, body)
 
     def pick(self, body: Body) -> PickPlaceCommand:
         """Return the pick of a body at its best grasp."""

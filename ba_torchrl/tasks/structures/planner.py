@@ -33,18 +33,12 @@ def next_move(assigner: SlotAssigner, area: PlacementArea, grasps: Grasps) -> Mo
     return _Planner(assigner, area, grasps).next_move()
 
 
-class _Cost(NamedTuple):
-    """Cost of an option; a lower one is better."""
+class _Option(NamedTuple):
+    """A choice with its cost: of two, that with fewer moves is better, then the nearer one."""
 
     moves: int
     """Moves besides those that fill the slots."""
     distance_m: float
-
-
-class _Option(NamedTuple):
-    """A choice with its cost."""
-
-    cost: _Cost
     body: Body
     move: Move | None
     """Its move to a slot; None for the ground."""
@@ -76,9 +70,9 @@ class _Planner:
                 moves = self._least_moves(choice)
                 if choice.body is not self.held and self.repair.is_blocked(choice.body):
                     moves += BLOCKED_MOVES
-                if best is None or moves <= best.cost.moves:
+                if best is None or moves <= best.moves:
                     option = self._option(choice, moves, assignment)
-                    best = option if best is None or option.cost < best.cost else best
+                    best = option if best is None or option[:2] < best[:2] else best
         assert best is not None  # the lowest empty slot always has a choice
         return best.move or self._to_ground(best.body)
 
@@ -92,7 +86,7 @@ class _Planner:
     def _choices(self, assignment: Assignment) -> Iterator[Choice]:
         """Yield the moves that fill an empty slot, or remove a piece so that one can be filled."""
         for number, slot in enumerate(self.slots):
-            partner = self.assigner.blueprint.partner(number)
+            _, partner = self.assigner.blueprint.bridge_on(number)
             if assignment[number] is not None or any(assignment[i] is None for i in slot.on):
                 continue
             if partner is not None and partner < number and assignment[partner] is None:
@@ -123,18 +117,17 @@ class _Planner:
             distance_m = math.dist(body.position[:2], move.position[:2])
             distance_m += DEFICIT_WEIGHT * move.deficit_m
         if places_held:
-            return _Option(_Cost(moves, 0.0), self.held, None)
+            return _Option(moves, 0.0, self.held, None)
         if self.held is None:
             distance_m += self.pick_cost_m(body)
-        return _Option(_Cost(moves, distance_m), body, move)
+        return _Option(moves, distance_m, body, move)
 
     def _to_slot(self, body: Body, number: int, assignment: Assignment) -> Move:
         """Return the move of a body to a slot."""
-        blueprint, slot, piece = self.assigner.blueprint, self.slots[number], self.pieces[body]
+        slot, piece = self.slots[number], self.pieces[body]
         supports = [assignment[i] for i in slot.on]
-        partner = blueprint.partner(number)
+        bridge, partner = self.assigner.blueprint.bridge_on(number)
         neighbor = None if partner is None else assignment[partner]
-        bridge = None if partner is None else self.slots[blueprint.bridge_on(number)]
         rest = [other for other in self.pieces if other is not body and other not in assignment]
         if not supports:
             if neighbor is None:

@@ -64,7 +64,7 @@ def place_distance_m(
         assignment: of the other slots.
     """
     slot, (x, y, _) = structure.blueprint.slots[number], body.position
-    partner = structure.blueprint.partner(number)
+    bridge, partner = structure.blueprint.bridge_on(number)
     other = None if partner is None else assignment[partner]
     if not slot.on and other is None:
         return math.inf
@@ -74,8 +74,7 @@ def place_distance_m(
         default=structure.terrain.height_m((x, y)),
     )
     aside_m = math.dist((x, y), mean_position(b.position for b in below)[:2]) if below else 0.0
-    if partner is not None:  # beside another piece, under the same bridge
-        bridge = structure.blueprint.slots[structure.blueprint.bridge_on(number)]
+    if bridge is not None:  # beside another piece, under it
         aside_m = max(aside_m - bridge.span.most_m / 2, 0.0)
         if other is not None:
             aside_m += assigner.span_error_m(bridge, body, other)

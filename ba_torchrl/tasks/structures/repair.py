@@ -7,15 +7,12 @@ needed. Pieces are removed from the top down.
 from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Iterator, Mapping
-from typing import TYPE_CHECKING
+from dataclasses import dataclass, field
 
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.structures.assignment import Assignment, SlotAssigner
 from ba_torchrl.tasks.structures.bridges import beside_supports
 from ba_torchrl.tasks.structures.moves import Choice, Grasps, Move
-
-if TYPE_CHECKING:
-    from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
 
 
 class Repair:
@@ -32,7 +29,7 @@ class Repair:
     def in_the_way(self, body: Body, number: int, assignment: Assignment) -> set[Body]:
         """Return the pieces to remove before a body can fill a slot whose supports are filled."""
         blueprint = self.assigner.blueprint
-        on, partner = blueprint.slots[number].on, blueprint.partner(number)
+        on, (_, partner) = blueprint.slots[number].on, blueprint.bridge_on(number)
         filled = on if partner is None or assignment[partner] is None else (*on, partner)
         misplaced = self.assigner.misplaced(assignment, filled)
         others = [other for other in misplaced if other is not body]
@@ -82,26 +79,17 @@ class Repair:
         return most + 2 if most else 0  # the piece is removed and placed again
 
 
+@dataclass
 class _GraspBlocking:
-    """Which pieces block the grasps of which others.
+    """Which pieces block the grasps of which others."""
 
-    Args:
-        above: for each body all that it supports, directly or through others.
-        held: the body in the gripper; it blocks no grasp.
-    """
-
-    def __init__(
-        self,
-        pieces: Iterable[Body],
-        above: Mapping[Body, frozenset[Body]],
-        held: Body | None,
-        grasps: Grasps,
-    ) -> None:
-        self.pieces = pieces
-        self.above = above
-        self.held = held
-        self.grasps = grasps
-        self._obstacles: dict[Body, list[frozenset[Body]]] = {}
+    pieces: Iterable[Body]
+    above: Mapping[Body, frozenset[Body]]
+    """For each body all that it supports, directly or through others."""
+    held: Body | None
+    """The body in the gripper; it blocks no grasp."""
+    grasps: Grasps
+    _obstacles: dict[Body, list[frozenset[Body]]] = field(default_factory=dict)
 
     def obstacles(self, body: Body) -> list[frozenset[Body]]:
         """Return for each grasp of a body the pieces that block it."""
@@ -154,33 +142,12 @@ class _GraspBlocking:
         return after
 
 
-def piece_to_pick(body: Body, grasps: PickPlaceGrasps) -> Body:
-    """Return the piece to pick so that a body can be picked.
-
-    This is the body itself if it has a grasp with clearance, else a piece outside of the structure
-    that blocks its grasps and has one. A gripper that cannot turn pushes them.
-    """
-    if not grasps.limits.turn_rad or grasps.is_free(body):
-        return body
-    placed = grasps.structure.assigner(None).placed()
-    return next(
-        (
-            other
-            for other in grasps.others(body)
-            if other not in placed
-            and all(grasps.blocks_grasp(body, other, None))
-            and grasps.is_free(other)
-        ),
-        body,
-    )
-
-
 def _bodies_above(assigner: SlotAssigner) -> dict[Body, frozenset[Body]]:
     """Return for each piece all pieces that it supports, directly or through others."""
     states = assigner.states
     above: dict[Body, frozenset[Body]] = {}
     # from the top down: a piece is higher than its supports
-    for body in sorted(assigner.pieces, key=lambda piece: -states[piece].position[2]):
+    for body in sorted(assigner.pieces, key=lambda piece: -piece.position[2]):
         supported = {
             other
             for other, state in states.items()
