@@ -118,18 +118,9 @@ class GraspPlanner:
         (x, y, z), yaw = tool
         yaws = np.arange(YAWS) * np.pi / YAWS if limits.turn_rad else np.array([yaw])
         best = None
-        low, high = self.workspace.z
         for body in bodies:
-            found = _search(
-                self.placed_samples(body),
-                np.array(body.position),
-                yaws,
-                heights,
-                np.array(self.corner),
-                low,
-                high,
-                self._jaws,
-            )
+            samples, center = self.placed_samples(body), np.array(body.position)
+            found = self._grasps(samples, center, yaws, heights)
             penalties = np.zeros(len(found)) if penalty is None else penalty(found)
             for row, added_cost in zip(found, penalties.tolist(), strict=True):
                 gx, gy, gz, risk = row[0], row[1], row[2], row[4]
@@ -200,18 +191,16 @@ class GraspPlanner:
         Args:
             samples: [N, 6] surface points and normals of the body.
         """
-        low, high = self.workspace.z
-        found = _search(
-            samples,
-            samples[:, :3].mean(axis=0),
-            np.array([tool[1]]),
-            self._empty_image,
-            np.array(self.corner),
-            low,
-            high,
-            self._jaws,
-        )
+        center, yaws = samples[:, :3].mean(axis=0), np.array([tool[1]])
+        found = self._grasps(samples, center, yaws, self._empty_image)
         return min(float(found[:, 4].min()), WORST_RISK) if len(found) else WORST_RISK
+
+    def _grasps(
+        self, samples: np.ndarray, center: np.ndarray, yaws: np.ndarray, heights: np.ndarray
+    ) -> np.ndarray:
+        """Return the result of `_search` for a body inside the workspace."""
+        corner = np.array(self.corner)
+        return _search(samples, center, yaws, heights, corner, *self.workspace.z, self._jaws)
 
     def placed_samples(self, body: Body) -> np.ndarray:
         """Return surface points and normals [N, 6] of a body at its present pose."""

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from ba_torchrl.core.errors import PlacementError
 from ba_torchrl.core.jit import njit
-from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import PlanarFrame
 from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
@@ -18,7 +16,7 @@ from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
 from ba_torchrl.tasks.terrain.sloped import OrientedArea, SlopedTerrain
-from ba_torchrl.tasks.workspace import Spacing, Workspace
+from ba_torchrl.tasks.workspace import Workspace
 
 SLOPE_RAD = (0.0, math.pi / 12)
 """Range of the slope of a pyramid."""
@@ -32,8 +30,6 @@ UNDERGROUND_M = 0.02
 FRICTION = 1.0
 COLORS: tuple[Color, Color] = ((0.8, 0.75, 0.64, 1.0), (0.72, 0.67, 0.56, 1.0))
 PLATFORM_COLOR: Color = (0.6, 0.66, 0.72, 1.0)
-ROCKING_STEPS = 20
-"""Physics steps in which objects that lie on several faces come to rest."""
 CLEARANCE_M = 0.03
 """Least distance of an object from the platform at the start, with space for a finger."""
 
@@ -60,6 +56,7 @@ class Bumps(SlopedTerrain):
     """
 
     place_words = ", between the bumps"
+    rocking_steps = 20
 
     def __init__(
         self,
@@ -163,19 +160,6 @@ class Bumps(SlopedTerrain):
             for values, half in ((along, area.half_x), (across, area.half_y))
         )
         return max(gaps) > CLEARANCE_M
-
-    def scatter(
-        self,
-        rng: np.random.Generator,
-        bodies: Sequence[Body],
-        spacings: Sequence[Spacing],
-        draw_yaw: Callable[[Body], float],
-        *,
-        base: Body,
-    ) -> None:
-        """Place bodies as `SlopedTerrain`, and let those on several faces come to rest."""
-        super().scatter(rng, bodies, spacings, draw_yaw, base=base)
-        self.world.step(ROCKING_STEPS)
 
     # ----------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -106,6 +106,8 @@ class OrientedArea(Area):
 class SlopedTerrain(Terrain):
     """A surface of plane faces; subclasses return its heights."""
 
+    rocking_steps: ClassVar[int] = 0
+    """Physics steps in which objects that lie on several faces come to rest at the start."""
     layout: Any
     """The random parts of the episode; its faces are aligned with a `heading_rad`."""
 
@@ -202,6 +204,7 @@ class SlopedTerrain(Terrain):
             else:
                 for body, (xy, yaw) in poses.items():
                     self.stand(body, xy, yaw)
+                self.world.step(self.rocking_steps)
                 return
         raise PlacementError(
             f"no room for {len(bodies)} objects apart from each other on this terrain: enlarge "
