@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +14,7 @@ from torchrl.modules import QValueActor
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
-from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
+from ba_torchrl.objectives.base import TransitionLoss
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
 """The loss on demonstrated actions that is added to the TD loss."""
@@ -145,11 +145,7 @@ class LevelDQNLoss(TransitionLoss):
         margin: margin of "dqfd" and "sdqfd".
         first_beta: inverse temperature of "adet" at the first level.
         later_beta: inverse temperature of "adet" at later levels.
-        reduction: of the samples' losses; the formulas above are "mean".
-        weighted_terms: terms that the importance weights multiply; "all" includes
-            loss_demonstration.
-        weight_norm: see `TransitionLoss`; "mean" is TorchRL's.
-        use_prioritized_weights: whether importance weights in the batch are used, as in TorchRL.
+        options: of `TransitionLoss`; the formulas above are for the reduction "mean".
     """
 
     value_network: nn.Module
@@ -174,18 +170,10 @@ class LevelDQNLoss(TransitionLoss):
         margin: float = 0.1,
         first_beta: float = 100.0,
         later_beta: float = 1.0,
-        reduction: Reduction | None = None,
-        weighted_terms: WeightedTerms = "critic_and_policy",
-        weight_norm: WeightNorm = "mean",
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
+        **options: Any,
     ) -> None:
         check_choice("demonstrations", demonstrations, Demonstrations)
-        super().__init__(
-            reduction,
-            weighted_terms=weighted_terms,
-            weight_norm=weight_norm,
-            use_prioritized_weights=use_prioritized_weights,
-        )
+        super().__init__(**options)
         if isinstance(value_network, QValueActor):
             value_network = SingleLevelValues(value_network)
         self.demonstrations = demonstrations

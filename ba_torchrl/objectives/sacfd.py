@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -19,7 +19,7 @@ from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
-from ba_torchrl.objectives.base import Reduction, TransitionLoss, WeightedTerms, WeightNorm
+from ba_torchrl.objectives.base import TransitionLoss
 from ba_torchrl.objectives.distance import ActionDistance, action_distance
 
 
@@ -65,14 +65,11 @@ class SACfDLoss(TransitionLoss):
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no flag of
             demonstrations in the batch.
         demonstration_distance: of the behaviour term.
-        reduction: of the samples' losses; the formulas above are "mean".
-        weighted_terms: terms that the importance weights multiply.
-        weight_norm: see `TransitionLoss`; "mean" is TorchRL's.
-        use_prioritized_weights: whether importance weights in the batch are used, as in TorchRL.
         views: number of views of the observation. If there are several, the entries of the
             observation have a dimension of views after the batch.
         target_views: number of views of the next observation, likewise.
         contrastive: of `contrastive_loss`: from anchors and positives [B, F] to losses [B].
+        options: of `TransitionLoss`; the formulas above are for the reduction "mean".
 
     Raises:
         ValueError: ``alpha_init`` is not positive, ``demonstration_distance`` is unknown, or the
@@ -121,13 +118,10 @@ class SACfDLoss(TransitionLoss):
         entropy_backup: bool = True,
         demonstration_weight: float = 1.0,
         demonstration_distance: ActionDistance = "mse",
-        reduction: Reduction | None = None,
-        weighted_terms: WeightedTerms = "critic_and_policy",
-        weight_norm: WeightNorm = "mean",
-        use_prioritized_weights: bool | Literal["auto"] = "auto",
         views: int = 1,
         target_views: int = 1,
         contrastive: nn.Module | None = None,
+        **options: Any,
     ) -> None:
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
@@ -136,12 +130,7 @@ class SACfDLoss(TransitionLoss):
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
             )
-        super().__init__(
-            reduction,
-            weighted_terms=weighted_terms,
-            weight_norm=weight_norm,
-            use_prioritized_weights=use_prioritized_weights,
-        )
+        super().__init__(**options)
         self.convert_to_functional(actor_network, "actor_network")
         self.convert_to_functional(encoder_network, "encoder_network", create_target_params=True)
         self.convert_to_functional(qvalue_network, "qvalue_network", create_target_params=True)

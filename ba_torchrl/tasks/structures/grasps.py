@@ -54,8 +54,8 @@ class Centred:
     """The tool points straight down, and both fingers have the same space beside the piece."""
 
     yaw_rad: float
-    middle_m: float = 0.0
-    """Middle of the piece along the closing axis, from its origin."""
+    across_m: float = 0.0
+    """Position of the tool along the closing axis, from the origin of the piece."""
     along_m: float = 0.0
     """Position of the tool along the length of the piece, from its origin."""
     is_shifted: ClassVar[bool] = False
@@ -63,7 +63,7 @@ class Centred:
     @property
     def centering_m(self) -> float:
         """How close the grasp is to the centre of the piece, at most 0."""
-        return -abs(self.along_m)
+        return -abs(self.along_m) - self.is_shifted
 
     @property
     def orientation(self) -> Quaternion:
@@ -74,35 +74,22 @@ class Centred:
         """Return the position of the tool for a piece at a position."""
         x, y, z = position
         cos, sin = math.cos(self.yaw_rad), math.sin(self.yaw_rad)
-        x, y = x + cos * self.middle_m, y + sin * self.middle_m
+        x, y = x + cos * self.across_m, y + sin * self.across_m
         return x - sin * self.along_m, y + cos * self.along_m, z
 
 
-@dataclass(frozen=True)
-class Shifted:
+@dataclass(frozen=True, kw_only=True)
+class Shifted(Centred):
     """The tool points straight down, and one finger descends close beside the piece.
 
-    Distances are from the origin of the piece along the gripper's x axis.
+    Ranges are along the gripper's x axis, from the origin of the piece.
     """
 
-    yaw_rad: float
-    shift_m: float
-    """Position of the tool."""
     far_finger_range_m: tuple[float, float]
     """Range that the far finger sweeps as it closes."""
     near_finger_range_m: tuple[float, float]
     """Range in which the near finger descends."""
-    centering_m: ClassVar[float] = -1.0
     is_shifted: ClassVar[bool] = True
-
-    @property
-    def orientation(self) -> Quaternion:
-        """Orientation of the tool."""
-        return downward_quaternion(self.yaw_rad)
-
-    def tool_position(self, position: Vector) -> Vector:
-        """Return the position of the tool for a piece at a position."""
-        return Centred(self.yaw_rad, self.shift_m).tool_position(position)
 
 
 @dataclass(frozen=True)
@@ -297,7 +284,7 @@ class PickPlaceGrasps(Grasps):
                     candidates += edges
                 else:
                     candidates += [
-                        Tilted(grasp.orientation, side * edge.shift_m, is_shifted=True)
+                        Tilted(grasp.orientation, side * edge.across_m, is_shifted=True)
                         for side, edge in zip((1, -1), edges, strict=False)
                     ]
         return candidates
@@ -458,9 +445,13 @@ def edge_grasps(
         far_m, near_m = extent_along_m(body, np.stack([ahead, -ahead])).tolist()
         shift_m = half_gap_m - near_m - EDGE_CLEARANCE_M
         if shift_m > EDGE_CLEARANCE_M:
-            far_finger_range_m = (far_m, shift_m + half_gap_m + finger_m)
-            near_finger_range_m = (-near_m - EDGE_CLEARANCE_M - finger_m, -near_m)
-            grasps.append(Shifted(yaw, shift_m, far_finger_range_m, near_finger_range_m))
+            far_range_m = (far_m, shift_m + half_gap_m + finger_m)
+            near_range_m = (-near_m - EDGE_CLEARANCE_M - finger_m, -near_m)
+            grasps.append(
+                Shifted(
+                    yaw, shift_m, far_finger_range_m=far_range_m, near_finger_range_m=near_range_m
+                )
+            )
     return grasps
 
 

@@ -37,7 +37,7 @@ def test_the_near_finger_of_an_edge_grasp_has_a_clearance_of_two_millimetres(wor
     one, other = edge_grasps(GRIPPER, body, 0.0)
     assert (one.yaw_rad, other.yaw_rad) == pytest.approx((0.0, math.pi))
     for candidate in (one, other):
-        assert candidate.shift_m == pytest.approx(0.040 - 0.015 - 0.002, abs=1e-4)
+        assert candidate.across_m == pytest.approx(0.040 - 0.015 - 0.002, abs=1e-4)
         assert candidate.far_finger_range_m == pytest.approx(
             (0.015, 0.023 + 0.040 + 0.014), abs=1e-4
         )
@@ -54,14 +54,14 @@ def test_the_shift_depends_on_opening_and_width_of_the_body(world, yaw, opening,
     body = world.add(CUBE, "cube")
     body.place(AT)
     for candidate in edge_grasps(GRIPPER, body, yaw, opening):
-        assert candidate.shift_m == pytest.approx(opening * 0.04 - half_m - 0.002, abs=1e-4)
+        assert candidate.across_m == pytest.approx(opening * 0.04 - half_m - 0.002, abs=1e-4)
 
 
 def test_shifts_differ_for_a_body_that_is_not_centred_on_its_origin(world):
     off = transform_mesh(box_mesh((0.03, 0.03, 0.03)), (0.01, 0.0, 0.0), 0.0)
     body = world.add(Solid(parts=(off,)), "off")
     body.place(AT)
-    shifts = [candidate.shift_m for candidate in edge_grasps(GRIPPER, body, 0.0)]
+    shifts = [candidate.across_m for candidate in edge_grasps(GRIPPER, body, 0.0)]
     assert shifts == pytest.approx([0.04 - 0.005 - 0.002, 0.04 - 0.025 - 0.002], abs=1e-4)
 
 
