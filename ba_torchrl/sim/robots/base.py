@@ -73,6 +73,10 @@ class Robot(ABC):
     revolute and metres for prismatic joints. The closed position is zero."""
     finger_links: ClassVar[tuple[frozenset[int], frozenset[int]]]
     """PyBullet indices of the links of the left and of the right finger."""
+    finger_gear_ratio: ClassVar[float] = -1.0
+    """The velocity of the left finger joint is minus this times that of the right one. Without such
+    a gear, two fingers with limited force do not resist motion of a held body along the closing
+    axis."""
     grasp_normal_signs: ClassVar[tuple[float, float]]
     """For each finger, the sign along the tool's x axis of the normal of a contact with a grasped
     body (from the body to the finger)."""
@@ -117,6 +121,12 @@ class Robot(ABC):
         self._finger_of_link = {
             link: side for side, links in enumerate(self.finger_links) for link in links
         }
+        for joint in self.arm_joints:
+            # PyBullet's limit constraint would accelerate a joint that is teleported beyond it
+            pybullet.changeDynamics(
+                self.id, joint, jointLowerLimit=-10, jointUpperLimit=10, physicsClientId=self.client
+            )
+        add_gear(self.client, self.id, self.finger_joints, self.finger_gear_ratio)
         for link in self.non_colliding_links:
             pybullet.setCollisionFilterGroupMask(self.id, link, 0, 0, physicsClientId=self.client)
 
@@ -135,46 +145,6 @@ class Robot(ABC):
             rotation: of the tool, such as `downward(yaw_rad)`.
             near: reference joints; among equivalent solutions, the closest is returned.
         """
-
-    # -- for subclasses ----------------------------------------------------------------------
-
-    def _widen_joint_limits(self, robot: int) -> None:
-        """Widen the joint limits of the arm.
-
-        PyBullet's limit constraint would accelerate a joint that is teleported beyond its limit.
-        """
-        for joint in self.arm_joints:
-            pybullet.changeDynamics(
-                robot, joint, jointLowerLimit=-10, jointUpperLimit=10, physicsClientId=self.client
-            )
-
-    def _add_gear(self, robot: int, first: int, second: int, ratio: float) -> None:
-        """Couple two joints by a gear constraint.
-
-        The velocity of the first joint is minus ``ratio`` times that of the second.
-        """
-        gear = pybullet.createConstraint(
-            robot,
-            first,
-            robot,
-            second,
-            pybullet.JOINT_GEAR,
-            (0, 1, 0),
-            (0, 0, 0),
-            (0, 0, 0),
-            physicsClientId=self.client,
-        )
-        pybullet.changeConstraint(
-            gear, gearRatio=ratio, maxForce=50, erp=0.5, physicsClientId=self.client
-        )
-
-    def _couple_fingers(self, robot: int, ratio: float) -> None:
-        """Couple the fingers by a gear.
-
-        Without it, two fingers with limited force do not resist motion of a held body along the
-        closing axis.
-        """
-        self._add_gear(robot, *self.finger_joints, ratio=ratio)
 
     # -- arm ---------------------------------------------------------------------------------
 
@@ -383,6 +353,15 @@ class Robot(ABC):
 
 
 ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots", Robot)
+
+
+def add_gear(client: int, robot: int, joints: tuple[int, int], ratio: float) -> None:
+    """Couple two joints: the velocity of the first is minus ``ratio`` times that of the second."""
+    axes = (0, 1, 0), (0, 0, 0), (0, 0, 0)
+    gear = pybullet.createConstraint(
+        robot, joints[0], robot, joints[1], pybullet.JOINT_GEAR, *axes, physicsClientId=client
+    )
+    pybullet.changeConstraint(gear, gearRatio=ratio, maxForce=50, erp=0.5, physicsClientId=client)
 
 
 REST_JOINT_RAD = 1e-3

@@ -32,6 +32,7 @@ class Kuka(Robot):
     finger_open_signs = (-1.0, 1.0)
     finger_open_position = 0.2
     finger_links = (frozenset({8, 9, 10}), frozenset({11, 12, 13}))
+    finger_gear_ratio = 1.0
     grasp_normal_signs = (-1.0, 1.0)
     non_colliding_links = tuple(range(-1, 7))
     hand_link = 7
@@ -46,7 +47,7 @@ class Kuka(Robot):
     _tip_joints = (10, 13)
 
     def load(self) -> int:
-        """Load the model, couple the fingers by a gear, and widen the joint limits."""
+        """Load the model, and keep the hand and the tips of the fingers straight."""
         with loading(self.model_file):
             robot = pybullet.loadSDF(self.model_file, physicsClientId=self.client)[0]
         # PyBullet sets the pose of the centre of mass, not of the link frame
@@ -57,7 +58,6 @@ class Kuka(Robot):
             (0, 0, 0, 1),
             physicsClientId=self.client,
         )
-        self._widen_joint_limits(robot)
         for joint in (7, *self._tip_joints):
             pybullet.setJointMotorControl2(
                 robot,
@@ -68,7 +68,6 @@ class Kuka(Robot):
                 positionGain=1.0,
                 physicsClientId=self.client,
             )
-        self._couple_fingers(robot, 1)
         return robot
 
     def set_opening(self, opening: float) -> None:

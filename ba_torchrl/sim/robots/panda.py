@@ -65,14 +65,11 @@ class Panda(Robot):
     finger_speed = 0.4
 
     def load(self) -> int:
-        """Load the model, couple the fingers by a gear, and widen the joint limits."""
+        """Load the model."""
         with loading(self.model_file):
-            robot = pybullet.loadURDF(
+            return pybullet.loadURDF(
                 self.model_file, _BASE_M, useFixedBase=True, physicsClientId=self.client
             )
-        self._widen_joint_limits(robot)
-        self._couple_fingers(robot, -1)
-        return robot
 
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None

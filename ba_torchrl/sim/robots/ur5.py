@@ -13,7 +13,7 @@ from xml.etree import ElementTree
 import pybullet
 
 from ba_torchrl.sim.geometry import Matrix, Vector, cross, dot
-from ba_torchrl.sim.robots.base import ROBOTS, Robot
+from ba_torchrl.sim.robots.base import ROBOTS, Robot, add_gear
 from ba_torchrl.sim.world import loading
 
 _MODELS = Path(__file__).parent / "models"
@@ -43,12 +43,9 @@ class UR5(Robot):
     finger_span_m = 42 * 0.3 / 128
 
     def load(self) -> int:
-        """Load arm and gripper as one model, and widen the joint limits of the arm."""
-        robot = _load_joined(
-            (_MODELS / "ur5_arm.urdf", _MODELS / self.gripper_model), _BASE_M, self.client
-        )
-        self._widen_joint_limits(robot)
-        return robot
+        """Load arm and gripper as one model."""
+        models = (_MODELS / "ur5_arm.urdf", _MODELS / self.gripper_model)
+        return _load_joined(models, _BASE_M, self.client)
 
     def inverse_kinematics(
         self, position: Vector, rotation: Matrix, near: Sequence[float] | None = None
@@ -116,12 +113,6 @@ class UR5ParallelJaw(UR5):
     finger_force = 10.0
     finger_speed = 0.4
 
-    def load(self) -> int:
-        """Load the model and couple the fingers by a gear."""
-        robot = super().load()
-        self._couple_fingers(robot, -1)
-        return robot
-
 
 @ROBOTS.register("ur5_robotiq")
 class UR5Robotiq(UR5):
@@ -157,8 +148,7 @@ class UR5Robotiq(UR5):
                 robot, joint, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=self.client
             )
         for joint, driver in self._followers.items():
-            self._add_gear(robot, driver, joint, ratio=-1)
-        self._couple_fingers(robot, -1)
+            add_gear(self.client, robot, (driver, joint), ratio=-1)
         return robot
 
     def set_opening(self, opening: float) -> None:
