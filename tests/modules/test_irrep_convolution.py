@@ -16,7 +16,6 @@ from ba_torchrl.modules.steerable.kernels import kernel_block, regular_irrep_ker
 from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     planar_rotations,
-    planar_rotations_and_flips,
     reuse_filters,
 )
 
@@ -24,7 +23,7 @@ GROUPS = {
     "C4": lambda: planar_rotations(4),
     "C8": lambda: planar_rotations(8),
     "C16": lambda: planar_rotations(16),
-    "D4": lambda: planar_rotations_and_flips(4),
+    "D4": lambda: planar_rotations(4, has_flips=True),
 }
 
 

@@ -6,7 +6,7 @@ import torch
 pytest.importorskip("escnn")
 
 from ba_torchrl.modules.steerable.kernels import kernel_block
-from ba_torchrl.modules.steerable.layers import planar_rotations, planar_rotations_and_flips
+from ba_torchrl.modules.steerable.layers import planar_rotations
 from ba_torchrl.modules.steerable.planar import planar_space
 from tests.fresh import run_script
 from tests.modules.networks import equivariant_outputs
@@ -36,7 +36,7 @@ def representations(space, flips, order):
 )
 def test_kernels_are_those_of_escnn(order, flips, sizes):
     """In the same order and with the same signs: weights of policies are their coefficients."""
-    theirs = planar_rotations_and_flips(order) if flips else planar_rotations(order)
+    theirs = planar_rotations(order, has_flips=flips)
     ours = planar_space(order, flips)
     expected, actual = (representations(space, flips, order) for space in (theirs, ours))
     for name, rep in actual.items():

@@ -18,7 +18,6 @@ from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     filter_generator,
     planar_rotations,
-    planar_rotations_and_flips,
     planar_yaws,
 )
 from ba_torchrl.sim.vision.in_hand import crop
@@ -96,7 +95,7 @@ def test_in_hand_encoders_refuse_unsupported_sizes():
 
 
 def dynamic(kernel_size=3, count=3, group="D4"):
-    gspace = planar_rotations_and_flips(4) if group == "D4" else planar_rotations(8)
+    gspace = planar_rotations(4, has_flips=True) if group == "D4" else planar_rotations(8)
     layer = DynamicSteerableConv2d(gspace, gspace.regular_repr, count, kernel_size)
     return gspace, layer, torch.randn(4, layer.num_coefficients)
 

@@ -17,7 +17,6 @@ from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     SteerableLinear,
     planar_rotations,
-    planar_rotations_and_flips,
     reuse_filters,
 )
 
@@ -81,7 +80,7 @@ CASES = [
 
 def build(case):
     order, inputs, outputs, kernel_size = case
-    gspace = planar_rotations_and_flips(4) if order == "D4" else planar_rotations(order)
+    gspace = planar_rotations(4, has_flips=True) if order == "D4" else planar_rotations(order)
     types = field_types(gspace, inputs), field_types(gspace, outputs)
     stride = 2 if kernel_size == 4 else 1
     ours = SteerableConv2d(gspace, *types, kernel_size, padding=kernel_size // 2, stride=stride)
@@ -183,7 +182,7 @@ def test_kernels_of_dihedral_groups_do_not_depend_on_signs_of_singular_vectors(s
     monkeypatch.setattr(coefficients, "_clebsh_gordan_tensor", tensor)
     decomposition = coefficients._find_tensor_decomposition.func
     monkeypatch.setattr(coefficients, "_find_tensor_decomposition", decomposition)
-    gspace = planar_rotations_and_flips(4)  # escnn keeps kernels in it
+    gspace = planar_rotations(4, has_flips=True)  # escnn keeps kernels in it
     regular, trivial, vector = gspace.regular_repr, gspace.trivial_repr, gspace.irrep(1, 1)
     sums = []
     for reps, size in (((trivial, regular), 3), ((regular, regular), 3), ((regular, vector), 1)):

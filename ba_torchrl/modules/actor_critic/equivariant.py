@@ -30,7 +30,6 @@ from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     SteerableLinear,
     planar_rotations,
-    planar_rotations_and_flips,
 )
 
 if TYPE_CHECKING:
@@ -251,8 +250,7 @@ class EquivariantConfig(ImageNetworkConfig):
         self.check_images(spec)
         if self.reflections and self.group_order < 3:
             raise ValueError("reflections need a group_order of at least 3")
-        group = planar_rotations_and_flips if self.reflections else planar_rotations
-        gspace = group(self.group_order)
+        gspace = planar_rotations(self.group_order, has_flips=self.reflections)
         action = ActionFields(spec.action_sequence, has_reflections=self.reflections)
         pose = PoseFields(spec, has_reflections=self.reflections)
         features = [(gspace.regular_repr, self.n_hidden), *pose.types(gspace)]

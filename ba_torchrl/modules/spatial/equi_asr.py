@@ -26,7 +26,7 @@ from ba_torchrl.modules.steerable.layers import (
     SteerableConv2d,
     SteerableLinear,
     filter_generator,
-    planar_rotations_and_flips,
+    planar_rotations,
     planar_yaws,
 )
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
@@ -190,7 +190,7 @@ class EquiASRConfig(ASRNetworkConfig):
         self, spec: SpatialSpec, yaw_config: EquiASRConfig, patch_size: int
     ) -> tuple[EquivariantPixelValues, tuple[HeightView, EquivariantYawValues]]:
         """Return the values of the pixels, and those of the yaws with their view."""
-        gspace = planar_rotations_and_flips(self.group_order)
+        gspace = planar_rotations(self.group_order, has_flips=True)
         positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
         gspace, yaw_repr = planar_yaws(self.num_rotations, spec.half_rotation)
         channels = positions.scene_channels

@@ -18,7 +18,7 @@ from ba_torchrl.modules.spatial.base import (
 )
 from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.spatial.unet import PlainPixelValues
-from ba_torchrl.modules.steerable.layers import planar_rotations_and_flips, planar_yaws
+from ba_torchrl.modules.steerable.layers import planar_rotations, planar_yaws
 
 _DEFAULT_GROUP_ORDER = 4
 
@@ -87,7 +87,7 @@ class EquiFCNConfig(SpatialImageConfig):
         yaw = has_yaw("equi_fcn", spec)
         require_unet_size("equi_fcn", spec.image_size)
         if not yaw:
-            gspace = planar_rotations_and_flips(self.group_order or _DEFAULT_GROUP_ORDER)
+            gspace = planar_rotations(self.group_order or _DEFAULT_GROUP_ORDER, has_flips=True)
             values = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, self)
             return FCN(values, spec.image_size, None)
         if self.group_order is not None:

@@ -59,23 +59,16 @@ def reuse_filters() -> Iterator[None]:
         _expanded.reset(token)
 
 
-def planar_rotations(order: int) -> GSpace2D | PlanarSpace:
-    """Return the space of planar images under the rotations of the cyclic group C_order.
+def planar_rotations(order: int, *, has_flips: bool = False) -> GSpace2D | PlanarSpace:
+    """Return the space of planar images under the cyclic group C_order, or the dihedral D_order.
 
     It is escnn's, or where escnn is not installed one of the same representations.
     """
     try:
-        return import_escnn("escnn.gspaces").rot2dOnR2(order)
+        gspaces = import_escnn("escnn.gspaces")
     except MissingPackageError:
-        return planar_space(order, has_flips=False)
-
-
-def planar_rotations_and_flips(order: int) -> GSpace2D | PlanarSpace:
-    """Return the space of planar images under the dihedral group, as `planar_rotations`."""
-    try:
-        return import_escnn("escnn.gspaces").flipRot2dOnR2(order)
-    except MissingPackageError:
-        return planar_space(order, has_flips=True)
+        return planar_space(order, has_flips)
+    return (gspaces.flipRot2dOnR2 if has_flips else gspaces.rot2dOnR2)(order)
 
 
 def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representation]:
