@@ -178,7 +178,13 @@ def test_reversed_actions_build_nine_structures_of_ten(task):
     assert scores.success_rate >= 0.95
 
 
-@pytest.mark.parametrize("config", [{"action_sequence": "pxyzrrr"}, {"in_hand_mode": "proj"}])
+@pytest.mark.parametrize(
+    "config",
+    [
+        {"action_sequence": "pxyzrrr"},
+        pytest.param({"in_hand_mode": "proj"}, marks=pytest.mark.slow),
+    ],
+)
 def test_reversed_actions_build_with_other_parameters(config):
     scores = replay_scores(TASK, 4, **config)
     assert scores.reversible == scores.success_rate == 1

@@ -79,26 +79,6 @@ def test_a_run_writes_its_files(tmp_path):
     assert find_checkpoint(folder).name.endswith("6")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("parallel", [False, True])
-def test_runs_of_one_seed_are_equal_and_of_two_differ(tmp_path, parallel):
-    def losses(name, seed):
-        config = tiny(
-            tmp_path / name,
-            seed=seed,
-            parallel=parallel,
-            start_method="fork",
-            threads=1,
-            **{**SHORT, "total_updates": 4},
-        )
-        Experiment(config, progress=False).run()
-        return read_scalars(tmp_path / name / "run")["train/loss_qvalue"].values.tolist()
-
-    first = losses("a", 0)
-    assert first == losses("b", 0)
-    assert first != losses("c", 1)
-
-
 @pytest.mark.parametrize("tf32", [None, True, False])
 def test_tensor_float_32_is_set_for_convolutions_and_products(tf32, tmp_path):
     places = torch.backends.cuda.matmul, torch.backends.cudnn

@@ -7,7 +7,6 @@ import re
 import signal
 import subprocess
 import sys
-import threading
 import time
 from pathlib import Path
 
@@ -24,6 +23,7 @@ from ba_torchrl.training.grid.plan import status
 from tests.recipes import recipe
 from tests.record.test_report import RESULT, policy_test, write
 from tests.training.grid.grids import COMMON, REACH, planned
+from tests.training.test_resume import interrupt
 
 FAKE_WORKER = """
 import json, os, pathlib, signal, sys, time
@@ -278,49 +278,15 @@ def test_a_damaged_file_concerns_its_run_only(tmp_path, fake, name, detail):
 
 @pytest.mark.slow
 def test_a_killed_run_is_resumed_in_a_new_process(tmp_path):
-    (run,) = planned(tmp_path, seeds=[5], common={"total_updates": 90, "eval_every": 15})
-    state = run.folder / "resume"
-    pids = []
-
-    def kill_after_an_evaluation():
-        for _ in range(48_000):
-            if any(not path.name.startswith(".") for path in state.glob("*")):
-                pids.extend(children_of(os.getpid()))
-                for pid in pids:
-                    os.kill(pid, signal.SIGKILL)
-                return
-            time.sleep(0.005)
-
-    killer = threading.Thread(target=kill_after_an_evaluation)
-    killer.start()
-    failures = run_all([run], progress=False)
-    killer.join()
-    assert len(pids) == 1
-    assert failures == {run.folder: "killed by SIGKILL"}
-    assert status(run).state == "failed"
-    (run.folder / "failure.json").unlink()
+    (run,) = planned(tmp_path, seeds=[5])
+    interrupt(run, after=5)
     found = status(run)
-    assert found.state == "interrupted"
-    updates = int(found.detail.split()[3])
+    assert (found.state, found.detail.split()[3]) == ("interrupted", "4")
     assert run_all([run], progress=False) == {}
     result = read_result(run.folder)
-    assert result.resumed_at == [updates]
-    assert [point.updates for point in result.curve] == list(range(0, 91, 15))
-    assert not state.exists()
-
-
-def children_of(pid):
-    """Return the processes that this one started to run benchmarks."""
-    found = []
-    for path in Path("/proc").glob("[0-9]*/status"):
-        try:
-            parent = path.read_text().split("PPid:\t")[1].split("\n")[0]
-            command = (path.parent / "cmdline").read_text()
-        except OSError:  # the process has ended
-            continue
-        if int(parent) == pid and "ba_torchrl.training.grid.run_one" in command:
-            found.append(int(path.parent.name))
-    return found
+    assert result.resumed_at == [4]
+    assert [point.updates for point in result.curve] == [0, 2, 4, 6]
+    assert not (run.folder / "resume").exists()
 
 
 @pytest.mark.usefixtures("cached_presets")
