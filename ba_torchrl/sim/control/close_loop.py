@@ -230,7 +230,7 @@ class CloseLoopController:
     def _is_undisturbed(self, held: Body) -> bool:
         """Whether all other bodies are at rest, and none that can move touched the hand or it."""
         movable = {body.id for body in self.world.moving_bodies}
-        touching = (point for point in self._outer_contacts(held) if point.other_id in movable)
+        touching = (point for point in hand_contacts(self.robot, held) if point.other_id in movable)
         return not is_any_within(touching) and self.world.is_still(except_for=held)
 
     def _unwind_wrist(self) -> None:
@@ -268,7 +268,7 @@ class CloseLoopController:
             if held is not None:
                 place_in_tool_frame(self.robot, held, grasp)
             self.world.detect_collisions()
-            if is_any_within(self._outer_contacts(held), self.limits.path_margin_m):
+            if is_any_within(hand_contacts(self.robot, held), self.limits.path_margin_m):
                 break
             free, done = joints, i / count
         if held is not None and done == 0.0:
@@ -299,7 +299,7 @@ class CloseLoopController:
         """Whether the hand has a vertical contact, or is close to one."""
         return any(
             point.is_vertical and point.distance_m < 2 * self.limits.press_stride_m
-            for point in self._outer_contacts(None)
+            for point in hand_contacts(self.robot, None)
         )
 
     def _contact_profile(self, path: Path, remaining: float) -> list[float]:
@@ -338,7 +338,7 @@ class CloseLoopController:
         robot, limits = self.robot, self.limits
         vertical_n = limits.max_vertical_force_n
         if path.goes_up:  # closing fingertips may have pressed on the floor with more
-            vertical_n = max(vertical_n, vertical_force_n(self._outer_contacts(held)))
+            vertical_n = max(vertical_n, vertical_force_n(hand_contacts(self.robot, held)))
         has_arrived = True
         for fraction in fractions:
             joints = path.joints_at(fraction)
@@ -348,7 +348,7 @@ class CloseLoopController:
             before = robot.joints
             robot.command(joints)
             self.world.step()
-            points = self._outer_contacts(held)
+            points = hand_contacts(self.robot, held)
             yields_vertically = vertical_force_n(points) > vertical_n
             yields_laterally = lateral_force_n(points) > limits.max_lateral_force_n
             if yields_vertically or yields_laterally:
@@ -365,9 +365,6 @@ class CloseLoopController:
         if max(abs(a - b) for a, b in zip(measured, robot.joints, strict=True)) > 5e-3:
             robot.command(measured)  # ends the force against the body that stopped the arm
         return has_arrived
-
-    def _outer_contacts(self, held: Body | None) -> list[Contact]:
-        return hand_contacts(self.robot, held)
 
 
 def hand_contacts(robot: Robot, held: Body | None) -> list[Contact]:

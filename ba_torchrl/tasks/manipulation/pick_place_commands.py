@@ -18,8 +18,6 @@ ROUNDING_RAD = 1e-9
 """A yaw below this counts as zero. A tiny negative yaw would wrap to half a turn."""
 NO_OP_Z_M = 0.1
 """Height of the tool of a no-op."""
-OFFSET_SHARE = 1.0
-"""Largest deviation of a grasp along each axis, as a multiple of the object's half extent."""
 
 
 def pick_command(tool: Pose) -> PickPlaceCommand:
@@ -78,13 +76,14 @@ def scene_generator(world: World) -> np.random.Generator:
 def perturbed_pick(world: World, body: Body, grasp: Pose, limits: ActionLimits) -> PickPlaceCommand:
     """Return a pick with a random deviation from a grasp, the same for the same scene.
 
-    It may succeed where the grasp fails, or push the body to where the grasp succeeds. Small
-    deviations are more likely than large ones. The yaw deviates if the gripper can turn.
+    It may succeed where the grasp fails, or push the body to where the grasp succeeds. Along each
+    axis it is at most half the body's extent; small deviations are more likely than large ones. The
+    yaw deviates if the gripper can turn.
     """
     rng = scene_generator(world)
     low, high = np.array(body.shape.bounds_m)
     share = rng.uniform()
-    half = OFFSET_SHARE * share * (high - low) / 2
+    half = share * (high - low) / 2
     dx, dy, _ = body.pose.rotate(rng.uniform(-half, half)[None])[0].tolist()
     x, y, z = grasp.position
     turn = share * float(rng.uniform(-math.pi / 2, math.pi / 2)) if limits.turn_rad else 0.0

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
@@ -92,21 +91,27 @@ class PickPlaceExpert:
         )
 
     def _place(self, move: Move) -> PickPlaceCommand:
-        """Return the place that brings the held body to the pose of a move."""
+        """Return the place that brings the held body to the pose of a move.
+
+        Of several yaws it is the first at which the opening fingers have the largest clearance.
+        """
         tool, held = self.robot.tool_frame(), move.body.pose
         if self.limits.can_tilt:
             return place_command(tool, held, self._best_release(move))
-        yaw = tool.yaw_rad
         if not self.limits.turn_rad:
-            yaw = 0.0
+            yaws = [0.0]
         elif move.yaw_rad is None:
             yaws = [math.pi * i / RELEASE_YAWS for i in range(RELEASE_YAWS)]
-            yaw = self._release_yaw(move, yaws)
         else:
             aligned = tool.yaw_rad + wrap_angle(move.yaw_rad - move.piece.yaw_rad(move.body))
             count = max(1, round(math.pi / move.yaw_period_rad))  # a half turn swaps the fingers
             yaws = [aligned + move.yaw_period_rad * i for i in range(count)]
-            yaw = self._release_yaw(move, yaws)
+
+        def clearance_m(yaw_rad: float) -> float:
+            found_m = self.grasps.clearance_m(move.body, yaw_rad, move.position)
+            return min(found_m, SUFFICIENT_CLEARANCE_M)
+
+        yaw = yaws[0] if len(yaws) == 1 else max(yaws, key=clearance_m)
         return place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
 
     def _release_poses(self, move: Move) -> list[Pose]:
@@ -153,11 +158,3 @@ class PickPlaceExpert:
             move.body, [Tilted(tool.orientation)], self.grasps.others(move.body), tool.position
         )
         return min(clearance_m, SUFFICIENT_CLEARANCE_M) - max(lowest - z, 0.0)
-
-    def _release_yaw(self, move: Move, yaws_rad: Sequence[float]) -> float:
-        """Return the first of the yaws at which the opening fingers have the largest clearance."""
-        clearances = [
-            min(self.grasps.clearance_m(move.body, yaw, move.position), SUFFICIENT_CLEARANCE_M)
-            for yaw in yaws_rad
-        ]
-        return yaws_rad[clearances.index(max(clearances))]
