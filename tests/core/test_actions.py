@@ -13,6 +13,7 @@ from ba_torchrl.core.actions import (
     wrap_angle,
 )
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.sim.geometry import euler_matrix
 
 
 def test_components_follow_the_sequence_and_are_scaled():
@@ -65,16 +66,7 @@ BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.0, 0.4))
 
 
 def rotation(rz, ry, rx):
-    """Rz Ry Rx, written out."""
-
-    def turn(axis, angle):
-        i, j = [(1, 2), (2, 0), (0, 1)][axis]
-        matrix = np.eye(3)
-        matrix[i, i] = matrix[j, j] = math.cos(angle)
-        matrix[i, j], matrix[j, i] = -math.sin(angle), math.sin(angle)
-        return matrix
-
-    return turn(2, rz) @ turn(1, ry) @ turn(0, rx)
+    return np.array(euler_matrix(rz, ry, rx))
 
 
 @pytest.mark.parametrize("sequence", ["pxy", "pxyr", "pxyzrrr", "xyp", "rxyzp", "yx", "rrxyz"])

@@ -15,6 +15,7 @@ from ba_torchrl.modules.spatial.policy import (
     SpatialValues,
     spatial_policy,
 )
+from ba_torchrl.sim.geometry import euler_matrix
 
 BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
 PIXELS = Level(("x", "y"), (6, 8))
@@ -130,14 +131,7 @@ def test_indices_of_six_degrees_of_freedom_are_converted_both_ways(sequence, hal
 
 
 def tool(action):
-    """Return the rotation matrix Rz Ry Rx of an action (p, x, y, z, rz, ry, rx)."""
-    (cz, cy, cx), (sz, sy, sx) = (f(action[4:].double()).tolist() for f in (torch.cos, torch.sin))
-    turns = (
-        [[cz, -sz, 0], [sz, cz, 0], [0, 0, 1]],
-        [[cy, 0, sy], [0, 1, 0], [-sy, 0, cy]],
-        [[1, 0, 0], [0, cx, -sx], [0, sx, cx]],
-    )
-    return torch.linalg.multi_dot([torch.tensor(turn, dtype=torch.float64) for turn in turns])
+    return torch.tensor(euler_matrix(*action[4:].tolist()), dtype=torch.float64)
 
 
 def test_a_yaw_close_to_half_a_turn_negates_the_tilts():

@@ -16,21 +16,12 @@ from ba_torchrl.tasks.manipulation.pick_place_commands import (
     swaps_fingers,
 )
 from ba_torchrl.tasks.workspace import Workspace
-
-FLIP = Rotation.from_matrix(np.diag([1.0, -1.0, -1.0]))
-"""Rotation of a tool that points down."""
+from tests.sim.test_geometry import FLIP, homogeneous
 
 
 def pose_of(position, rz, ry=0.0, rx=0.0, flip=False):
     turn = Rotation.from_euler("ZYX", (rz, ry, rx))
     return Pose(position, tuple((turn * FLIP if flip else turn).as_quat().tolist()))
-
-
-def matrix_of(pose):
-    matrix = np.eye(4)
-    matrix[:3, :3] = Rotation.from_quat(pose.orientation).as_matrix()
-    matrix[:3, 3] = pose.position
-    return matrix
 
 
 @pytest.mark.parametrize("angles", [(0.3, 0.0, 0.0), (-2.0, 0.4, -0.7), (3.0, -0.1, 0.2)])
@@ -50,8 +41,8 @@ def test_the_held_body_moves_rigidly_with_the_tool(seed):
     tool = pose_of(tuple(rng.normal(size=3)), *rng.uniform(-1, 1, 3), flip=True)
     held, target = (pose_of(tuple(rng.normal(size=3)), *rng.uniform(-1, 1, 3)) for _ in range(2))
     goal = carrying_pose(tool, held, target)
-    in_tool = np.linalg.inv(matrix_of(tool)) @ matrix_of(held)
-    np.testing.assert_allclose(matrix_of(goal) @ in_tool, matrix_of(target), atol=1e-12)
+    in_tool = np.linalg.inv(homogeneous(tool)) @ homogeneous(held)
+    np.testing.assert_allclose(homogeneous(goal) @ in_tool, homogeneous(target), atol=1e-12)
 
 
 def test_a_place_on_a_slope_tilts_the_tool():
@@ -62,8 +53,8 @@ def test_a_place_on_a_slope_tilts_the_tool():
     assert command.primitive == PLACE
     assert command.angles_rad == pytest.approx((1.0, 0.0, 0.2))
     placed = pose_of(command[1:4], *command.angles_rad, flip=True)
-    in_tool = np.linalg.inv(matrix_of(tool)) @ matrix_of(held)
-    np.testing.assert_allclose(matrix_of(placed) @ in_tool, matrix_of(slope), atol=1e-12)
+    in_tool = np.linalg.inv(homogeneous(tool)) @ homogeneous(held)
+    np.testing.assert_allclose(homogeneous(placed) @ in_tool, homogeneous(slope), atol=1e-12)
 
 
 def test_a_yaw_rotates_the_held_body_about_the_tool():

@@ -1,7 +1,10 @@
 """Random views against index arithmetic."""
 
+import itertools
+
 import pytest
 import torch
+import torch.nn.functional as F
 from tensordict import TensorDict
 
 from ba_torchrl.core import keys
@@ -49,27 +52,15 @@ def views(size=SIZE, **settings):
 
 def offset_of(view, image, padding=0):
     """Return the offset of a view [1, h, h] in an image [1, H, H], by trying all of them."""
-    size, height = view.shape[-1], image.shape[-1]
-    found = []
-    for row in range(height + 2 * padding - size + 1):
-        for column in range(height + 2 * padding - size + 1):
-            expected = [
-                [
-                    float(
-                        image[
-                            0,
-                            min(max(row + i - padding, 0), height - 1),
-                            min(max(column + j - padding, 0), height - 1),
-                        ]
-                    )
-                    for j in range(size)
-                ]
-                for i in range(size)
-            ]
-            if view[0].tolist() == expected:
-                found.append((row, column))
-    assert len(found) == 1
-    return found[0]
+    size = view.shape[-1]
+    padded = F.pad(image[None], [padding] * 4, mode="replicate")[0, 0]
+    starts = itertools.product(range(len(padded) - size + 1), repeat=2)
+    (found,) = (
+        (row, column)
+        for row, column in starts
+        if torch.equal(view[0], padded[row : row + size, column : column + size])
+    )
+    return found
 
 
 def test_views_are_the_pixels_from_their_offset_on():

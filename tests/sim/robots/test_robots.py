@@ -8,7 +8,7 @@ import pytest
 
 from ba_torchrl.sim.contacts import contacts, is_any_within
 from ba_torchrl.sim.control.close_loop import CloseLoopController
-from ba_torchrl.sim.geometry import downward
+from ba_torchrl.sim.geometry import downward, euler_matrix, rotation_array
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
@@ -74,21 +74,10 @@ def robot(scene):
     return scene.robot
 
 
-def rotation_about(axis, angle):
-    axis = np.eye(3)["xyz".index(axis)]
-    cross = np.cross(np.eye(3), axis)
-    return np.eye(3) - math.sin(angle) * cross + (1 - math.cos(angle)) * cross @ cross
-
-
 def random_rotation(rng, tilt, *yaws):
-    turn = rotation_about("x", rng.uniform(-tilt, tilt)) @ rotation_about(
-        "y", rng.uniform(-tilt, tilt)
-    )
+    about_x, about_y = -rng.uniform(-tilt, tilt), -rng.uniform(-tilt, tilt)
+    turn = np.array(euler_matrix(0.0, 0.0, about_x)) @ euler_matrix(0.0, about_y, 0.0)
     return turn @ np.array(downward(rng.uniform(*yaws)))
-
-
-def rotation_of(quaternion):
-    return np.array(pybullet.getMatrixFromQuaternion(quaternion)).reshape(3, 3)
 
 
 def angle_between(a, b):
@@ -118,7 +107,7 @@ def test_inverse_kinematics_in_the_workspace(robot, box, tilt, share):
         robot.teleport(joints)
         reached, quaternion = robot.tool_frame()
         np.testing.assert_allclose(reached, position, atol=1e-4)
-        assert angle_between(rotation_of(quaternion), rotation) < 2e-3
+        assert angle_between(rotation_array(quaternion), rotation) < 2e-3
     assert solved >= share * 400
     assert robot.inverse_kinematics((1.5, 0.0, 0.2), downward(0.0)) is None
 

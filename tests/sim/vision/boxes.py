@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 
+from ba_torchrl.sim.geometry import rotation_array
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.vision.depth import PosedShape
 from ba_torchrl.sim.vision.lens import FAR_M
@@ -30,12 +31,6 @@ def random_boxes(rng, count, span=0.15):
     return boxes
 
 
-def rotation(quaternion):
-    x, y, z, w = quaternion
-    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
-    return np.eye(3) + 2 * w * cross + 2 * cross @ cross
-
-
 def rays_of(lens, pixels):
     """Return the ray of each pixel, scaled to length one along the optical axis."""
     forward = np.array(lens.target_m) - lens.eye_m
@@ -54,8 +49,8 @@ def ray_depths(boxes, lens, pixels):
         depth = np.where(rays[..., 2] < 0, -eye[2] / rays[..., 2], np.inf)
         for box in boxes:
             position, turn = box.pose
-            start = (eye - position) @ rotation(turn)
-            steps = rays @ rotation(turn)
+            start = (eye - position) @ rotation_array(turn)
+            steps = rays @ rotation_array(turn)
             half = np.array(box.shape.size_m) / 2
             one, two = (-half - start) / steps, (half - start) / steps
             enter = np.minimum(one, two).max(axis=-1)

@@ -5,6 +5,7 @@ import math
 import numpy as np
 import pytest
 
+from ba_torchrl.sim.geometry import rotation_array
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.sim.vision.depth import (
     PosedShape,
@@ -14,14 +15,17 @@ from ba_torchrl.sim.vision.depth import (
     visible_points,
 )
 from ba_torchrl.sim.vision.lens import side_lenses
-from tests.sim.vision.boxes import CENTER, random_boxes, rotation
+from tests.sim.vision.boxes import CENTER, random_boxes
 
 WORKSPACE = ((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))
 
 
 def distance_to_box(points, box):
     position, turn = box.pose
-    inside = np.abs((points - np.array(position)) @ rotation(turn)) - np.array(box.shape.size_m) / 2
+    inside = (
+        np.abs((points - np.array(position)) @ rotation_array(turn))
+        - np.array(box.shape.size_m) / 2
+    )
     outer = np.linalg.norm(np.maximum(inside, 0), axis=1)
     return np.abs(outer + np.minimum(inside.max(axis=1), 0))
 

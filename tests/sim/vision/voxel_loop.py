@@ -4,6 +4,8 @@ import math
 
 import numpy as np
 
+from ba_torchrl.sim.geometry import euler_matrix
+
 
 def project_by_loops(heights, pixel_m, z_m, rz, ry, rx, middle=None, lowest=0):
     """Return the projections [3, n, n] of a heightmap [n, n] in the frame of a tool.
@@ -14,15 +16,7 @@ def project_by_loops(heights, pixel_m, z_m, rz, ry, rx, middle=None, lowest=0):
     n = len(heights)
     middle = (n - 1) / 2 if middle is None else middle
 
-    def turn(axis, angle):
-        cos, sin = math.cos(angle), math.sin(angle)
-        matrix = np.eye(3)
-        a, b = [other for other in range(3) if other != axis]
-        matrix[a, a] = matrix[b, b] = cos
-        matrix[a, b], matrix[b, a] = (-sin, sin) if axis != 1 else (sin, -sin)
-        return matrix
-
-    tool = turn(2, rz) @ turn(1, ry) @ turn(0, rx)
+    tool = np.array(euler_matrix(rz, ry, rx))
     cells = set()
     for i, j, k in np.ndindex(n, n, n):
         if heights[i, j] > z_m + (k - middle) * pixel_m:
