@@ -1,6 +1,11 @@
 """Teleoperation: keys become actions, and what is recorded is what was executed."""
 
 import contextlib
+import os
+import shutil
+import subprocess
+import sys
+import threading
 
 import numpy as np
 import pybullet
@@ -234,3 +239,89 @@ def test_episodes_that_are_complete_are_kept(end, env, tmp_path, monkeypatch):
         recipe("teleoperate", *words)
     assert read_demonstrations(tmp_path / "demos")[1]["episodes"] == 1
     assert [path.name for path in tmp_path.iterdir()] == ["demos"]
+
+
+@contextlib.contextmanager
+def display():
+    """A virtual display; yields the environment variables of its clients."""
+    read, write = os.pipe()
+    command = ["Xvfb", "-displayfd", str(write), "-screen", "0", "1024x768x24"]
+    server = subprocess.Popen(command, pass_fds=[write], stderr=subprocess.DEVNULL)
+    os.close(write)
+    try:
+        with os.fdopen(read) as number:
+            yield {**os.environ, "DISPLAY": f":{number.readline().strip()}"}
+    finally:
+        server.terminate()
+        server.wait()
+
+
+X_NAMES = {"up arrow": "Up", "down arrow": "Down", "left arrow": "Left", "right arrow": "Right"}
+
+
+@pytest.mark.slow  # the window is drawn by the CPU
+@pytest.mark.skipif(
+    not (shutil.which("Xvfb") and shutil.which("xdotool")), reason="needs Xvfb and xdotool"
+)
+@pytest.mark.parametrize("end", ["Escape", "interrupt"])
+def test_keys_in_the_window_record_an_episode(end, tmp_path, env):
+    """The keys of an episode are sent one by one; the second episode is incomplete and not kept."""
+    path = tmp_path / "demos"
+    env.reset(seed=7)
+    command = [sys.executable, "-m", "ba_torchrl", "teleoperate", TASK, "episodes=2"]
+    command += [f"path={path}", "seed=7", "env.obs_size=24", "fps=3"]
+    with display() as variables:
+        process = subprocess.Popen(
+            command,
+            env={**variables, "PYTHONUNBUFFERED": "1"},
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+        limit = threading.Timer(240, process.kill)
+        limit.start()
+
+        def send(*names):
+            combination = "+".join(X_NAMES.get(name, name) for name in names)
+            subprocess.run(["xdotool", "key", combination], env=variables, check=True)
+
+        keyboard, output = Keyboard(env.actions), []
+        is_reached = is_discarded = False
+        send_keys = next_keys(env)
+        try:
+            for line in process.stdout:
+                output.append(line)
+                if not line.startswith("episode "):
+                    continue
+                if line.startswith("episode 2"):
+                    if "step" in line:
+                        break
+                    if "discarded" not in line:
+                        send("space" if is_discarded else "r")
+                        is_discarded = True
+                elif "success" in line:
+                    is_reached = True
+                elif not is_reached:
+                    send(*send_keys)
+                    keyboard.read({})
+                    action = keyboard.read(events(RELEASED, *send_keys))
+                    state = env.step(env.rand_action().set(keys.ACTION, torch.tensor(action)))
+                    is_reached = bool(state[keys.NEXT, keys.DONE])
+                    send_keys = [] if is_reached else next_keys(env)
+            if end == "Escape":
+                send(end)
+            else:
+                process.send_signal(2)
+            output += process.communicate()[0]
+        finally:
+            limit.cancel()
+            process.kill()
+            process.wait()
+    text = "".join(output)
+    assert process.returncode == 0, text
+    assert "Traceback" not in text
+    assert text.count("discarded") == 1
+    (episode,), metadata = read_demonstrations(path)
+    assert metadata["source"] == "keyboard"
+    assert is_success(episode)
+    check_replay(env, episode, 7)
