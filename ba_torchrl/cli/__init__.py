@@ -39,8 +39,12 @@ def command_names() -> list[str]:
 
 
 @contextmanager
-def ends_with_reader() -> Iterator[None]:
-    """Context in which the end of the reader of the standard output ends the process silently."""
+def plain_ends() -> Iterator[None]:
+    """Context in which SIGINT, and the end of the reader of the standard output, end the process
+    without a traceback. Streams that are closed are those of the null device."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115
     try:
         try:
             yield
@@ -49,9 +53,12 @@ def ends_with_reader() -> Iterator[None]:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(128 + signal.SIGPIPE)
+    except KeyboardInterrupt:  # where a run does not note it: before and after its work
+        sys.stderr.write("stopped by SIGINT\n")
+        sys.exit(128 + signal.SIGINT)
 
 
-@ends_with_reader()
+@plain_ends()
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command that a command line names."""
     first, *rest = [*(sys.argv[1:] if arguments is None else arguments)] or ["--help"]
@@ -63,8 +70,13 @@ def main(arguments: Sequence[str] | None = None) -> None:
         print(f"{PROGRAM} {__version__}")  # noqa: T201
     elif first in command_names():
         tune_malloc()  # before torch allocates anything: halves the time of an update on a CPU
-        if os.getcwd() not in sys.path:  # where `plugins` are, as with `python -m`
-            sys.path.insert(0, os.getcwd())
+        try:
+            folder = os.getcwd()
+        except FileNotFoundError:
+            sys.stderr.write("error: the working directory was deleted\n")
+            sys.exit(EXIT_CODE)
+        if folder not in sys.path:  # where `plugins` are, as with `python -m`
+            sys.path.insert(0, folder)
         try:
             importlib.import_module(f"ba_torchrl.commands.{first}").COMMAND.run(rest)
         except ModuleNotFoundError as error:

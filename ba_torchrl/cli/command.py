@@ -159,8 +159,8 @@ class Command:
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
         if found.config_dir is not None and not Path(found.config_dir).is_dir():
             raise ConfigError(f"there is no folder {found.config_dir}")
-        overrides = [word for word in rest if "=" in word or word.startswith("~")]
-        bare = [word for word in rest if word not in overrides]
+        bare = [word for word in rest if "=" not in word and not word.startswith("~")]
+        overrides = [_readable(word) for word in rest if word not in bare]
         if bare:
             overrides += self._positional(bare, overrides)
         return Arguments(overrides, found.config_name, found.config_dir, found.help)
@@ -189,7 +189,7 @@ class Command:
         for name in names[: len(words)]:
             if any(override.startswith(f"{name}=") for override in overrides):
                 raise ConfigError(f"{name} is given twice")
-        values = ["'" + word.replace("'", "\\'") + "'" for word in words]
+        values = [_quoted(word) for word in words]
         if len(values) > len(names):
             values = [f"[{','.join(values)}]"]
         return [f"{name}={value}" for name, value in zip(names, values, strict=False)]
@@ -245,9 +245,21 @@ class Command:
             raise
 
 
+def _quoted(word: str) -> str:
+    return "'" + word.replace("'", "\\'") + "'"
+
+
+def _readable(override: str) -> str:
+    """Return an override with quotes around a text with letters that Hydra cannot read."""
+    name, _, value = override.partition("=")
+    is_read = value.isascii() or value[0] in "'\"[{"
+    return override if is_read else f"{name}={_quoted(value)}"
+
+
 def _explained(error: HydraException) -> ConfigError:
     """Return an error of Hydra, with the known names if it is about one that is unknown."""
-    first, cause = str(error).splitlines()[0], error.__cause__
+    cause = error.__cause__
+    first = (str(error) or repr(cause)).splitlines()[0]
     if isinstance(error, OverrideParseException):
         return ConfigError(f"cannot read {error.override!r}: {first}")
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import functools
-import signal
 import sys
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +12,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
-from ba_torchrl.cli import EXIT_CODE, ends_with_reader
+from ba_torchrl.cli import EXIT_CODE, plain_ends
 from ba_torchrl.core.errors import ConfigError, PartError, SettingsError, as_os_error
 from ba_torchrl.training import hydra_schema
 
@@ -35,7 +34,7 @@ def plain_errors(function: Callable[..., Any]) -> Callable[..., Any]:
     @functools.wraps(function)
     def decorated(*args: Any, **kwargs: Any) -> Any:
         try:
-            with ends_with_reader():
+            with plain_ends():
                 return function(*args, **kwargs)
         except (ConfigError, OmegaConfBaseException, OSError, MemoryError, RuntimeError) as error:
             text = _text(error)
@@ -44,9 +43,6 @@ def plain_errors(function: Callable[..., Any]) -> Callable[..., Any]:
             lines = [line.strip() for line in text.splitlines() if line.strip()]
             sys.stderr.write(f"error: {'; '.join(lines).replace(':; ', ': ')}\n")
             sys.exit(EXIT_CODE)
-        except KeyboardInterrupt:  # where a run does not note it: before and after its work
-            sys.stderr.write("stopped by SIGINT\n")
-            sys.exit(128 + signal.SIGINT)
 
     return decorated
 

@@ -73,7 +73,7 @@ def main(task: Task) -> None:
         counts = Counter(state.state for _, state in states)
         print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
     launcher = choose(LAUNCHERS, config.launcher, "launcher")
-    print_estimate(states, launcher.runs_at_once(config.jobs))
+    print_estimate(states, config.jobs if launcher.uses_jobs else 1)
     if config.dry_run:
         return
     launcher.check(runs)

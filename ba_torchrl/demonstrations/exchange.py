@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 import json
 import logging
-import os
 from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -86,8 +85,6 @@ def export_demonstrations(
         raise ValueError("there are no episodes to export")
     if form.suffixes and path.suffix.lower() not in form.suffixes:
         raise ConfigError(f"{path} could not be read back; end the path in {form.suffixes[0]}")
-    if os.path.lexists(path):
-        raise ConfigError(f"{path} exists already; choose another path")
     check_entries(episodes, task, env)
     roles = _roles(episodes[0])
     arrays = [_to_arrays(episode, roles) for episode in episodes]

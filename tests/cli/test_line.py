@@ -175,6 +175,31 @@ def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch)
     assert "  seeds=9" in capsys.readouterr().out
 
 
+def test_an_interruption_while_a_command_is_imported_is_one_line(monkeypatch, capsys):
+    def interrupted(_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli.importlib, "import_module", interrupted)
+    with pytest.raises(SystemExit) as end:
+        cli.main(["train"])
+    assert end.value.code == 128 + signal.SIGINT
+    assert capsys.readouterr().err == "stopped by SIGINT\n"
+
+
+def test_streams_that_are_closed_take_nothing(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    monkeypatch.setattr(sys, "stderr", None)
+    cli.main(["--version"])
+
+
+def test_a_working_directory_that_was_deleted_is_one_line(tmp_path, monkeypatch, capsys):
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    monkeypatch.chdir(gone)
+    gone.rmdir()
+    assert refused(["tasks"], capsys) == "error: the working directory was deleted\n"
+
+
 def test_errors_of_a_run_are_not_hidden(tmp_path, monkeypatch):
     def broken(_):
         raise ZeroDivisionError
@@ -233,5 +258,6 @@ def test_tasks_are_listed_described_and_written(tmp_path, capsys):
     assert "  close_loop/block_picking           the block is held" in capsys.readouterr().out
     cli.main(["tasks", "close_loop/block_picking"])
     assert "expert:             kuka 1.000 in 7.0 steps" in capsys.readouterr().out
-    cli.main(["tasks", "close_loop/block_picking", f"path={tmp_path / 'page.md'}"])
-    assert "### `close_loop/block_picking`" in (tmp_path / "page.md").read_text()
+    page = tmp_path / "it's a pagé.md"
+    cli.main(["tasks", "close_loop/block_picking", f"path={page}"])
+    assert "### `close_loop/block_picking`" in page.read_text()

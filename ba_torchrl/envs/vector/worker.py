@@ -319,11 +319,20 @@ def start_process(process: BaseProcess) -> None:
     ends starts the process.
     """
     if threading.current_thread() is threading.main_thread():
-        process.start()
+        _start(process)
         return
     with _lock:
         launcher = _launcher(os.getpid())
-    launcher.submit(process.start).result()
+    launcher.submit(_start, process).result()
+
+
+def _start(process: BaseProcess) -> None:
+    """Start a process, to which a terminal's signals do not come while it imports its modules."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @cache

@@ -1,7 +1,9 @@
 """Deaths that go on slow a vector of environments and do not end it; no worker survives it."""
 
+import multiprocessing
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import ba_torchrl
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.vector import parallel
+from ba_torchrl.envs.vector.worker import start_process
 from tests.fresh import script
 
 PARENT = """
@@ -156,6 +159,17 @@ def test_signals_for_all_processes_leave_the_workers_to_the_parent(make_fakes):
     step = env.step(act(env, state))
     assert not step["next", "fault"].any()
     assert env.restarts == 0
+
+
+def test_a_worker_receives_no_interruption_while_it_starts():
+    def blocked():
+        return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
+
+    process = multiprocessing.get_context("fork").Process(target=lambda: sys.exit(not blocked()))
+    start_process(process)
+    process.join()
+    assert process.exitcode == 0
+    assert not blocked()
 
 
 def test_worker_options_are_an_object_or_keywords_of_make_vector_env():

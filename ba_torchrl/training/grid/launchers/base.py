@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.registry import Registry
@@ -29,13 +30,12 @@ class Grid:
 class LauncherConfig(StrictModel, ABC):
     """Options of a launcher."""
 
+    uses_jobs: ClassVar[bool] = False
+    """Whether ``jobs`` runs take place at the same time."""
+
     def check(self, runs: Sequence[ExperimentConfig]) -> None:
         """Raise `ConfigError` unless the launcher can be used, before anything starts."""
         return
-
-    def runs_at_once(self, jobs: int) -> int:
-        """Return how many runs of ``jobs`` take place at the same time; 1 if it is not known."""
-        return 1
 
     @abstractmethod
     def run_all(self, grid: Grid) -> dict[Path, str]:

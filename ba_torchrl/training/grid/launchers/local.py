@@ -12,9 +12,7 @@ from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid, LauncherCon
 class LocalConfig(LauncherConfig):
     """One process of this machine for each run, ``jobs`` of them at the same time."""
 
-    def runs_at_once(self, jobs: int) -> int:
-        """Return ``jobs``."""
-        return jobs
+    uses_jobs = True
 
     def run_all(self, grid: Grid) -> dict[Path, str]:
         """Run the unfinished runs; see `LauncherConfig.run_all`."""
