@@ -10,7 +10,6 @@ from __future__ import annotations
 import keyword
 import re
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Annotated, Literal
 
 from ba_torchrl.cli import data_dir
@@ -18,6 +17,7 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import check_new, check_writable_file, checked
 from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.files import write_text
 
 TRAIN = "ba-torchrl train --config-name quickstart 'plugins=[{name}]'"
 NEXT = {
@@ -76,7 +76,7 @@ def main(settings: Settings) -> None:
         raise ConfigError(f"the module imports another {camel}; choose another name, as my_{name}")
     for path, text in zip(files(name), templates, strict=True):
         text = text.replace(old, name).replace(old_camel, camel)
-        Path(path).write_text(text, encoding="utf-8")
+        write_text(path, text)
     print(f"{' and '.join(files(name))} are written. Next:")
     for line in (f"python -m pytest test_{name}.py", *NEXT[kind]):
         print(f"  {line.format(name=name)}")
