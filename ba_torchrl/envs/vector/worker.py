@@ -15,8 +15,9 @@ import traceback
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
-from multiprocessing import util
+from multiprocessing import resource_tracker, util
 from multiprocessing.connection import Connection
+from multiprocessing.context import SpawnProcess
 from multiprocessing.process import BaseProcess
 from typing import Any, NamedTuple
 
@@ -328,6 +329,8 @@ def start_process(process: BaseProcess) -> None:
 
 def _start(process: BaseProcess) -> None:
     """Start a process, to which a terminal's signals do not come while it imports its modules."""
+    if isinstance(process, SpawnProcess):
+        resource_tracker.ensure_running()  # its own start unblocks SIGINT
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process.start()

@@ -3,8 +3,8 @@
 import multiprocessing
 import os
 import signal
-import sys
 import time
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 import fake_env
@@ -161,15 +161,22 @@ def test_signals_for_all_processes_leave_the_workers_to_the_parent(make_fakes):
     assert env.restarts == 0
 
 
-def test_a_worker_receives_no_interruption_while_it_starts():
-    def blocked():
-        return signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
-
-    process = multiprocessing.get_context("fork").Process(target=lambda: sys.exit(not blocked()))
-    start_process(process)
-    process.join()
-    assert process.exitcode == 0
-    assert not blocked()
+@pytest.mark.parametrize("method", ["fork", "spawn"])
+def test_a_worker_receives_no_interruption_while_it_starts(monkeypatch, method):
+    tracker = resource_tracker.ResourceTracker()  # one that does not run yet
+    for name in ("ensure_running", "getfd"):
+        monkeypatch.setattr(resource_tracker, name, getattr(tracker, name))
+    process = multiprocessing.get_context(method).Process(target=time.sleep, args=(60,))
+    try:
+        start_process(process)
+        status = Path(f"/proc/{process.pid}/status").read_text()
+    finally:
+        process.kill()
+        process.join()
+        tracker._stop()
+    blocked = int(status.split("SigBlk:")[1].split()[0], 16)
+    assert blocked & 1 << (signal.SIGINT - 1)
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 def test_worker_options_are_an_object_or_keywords_of_make_vector_env():
