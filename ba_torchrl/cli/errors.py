@@ -17,7 +17,8 @@ from ba_torchrl.core.errors import ConfigError, PartError, SettingsError, as_os_
 from ba_torchrl.training import hydra_schema
 
 _OF_RESOURCES = {
-    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ENAMETOOLONG),
+    *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ESTALE),
+    *(errno.ENAMETOOLONG, errno.ENOTDIR, errno.ELOOP),
     *(errno.EACCES, errno.EPERM, errno.EROFS),
     *(errno.ENOMEM, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
 }

@@ -40,7 +40,7 @@ def checked(check: Callable[[Any], Any]) -> AfterValidator:
 
 def check_new(path: str | Path) -> None:
     """Check that nothing exists at a path."""
-    if os.path.exists(path):
+    if os.path.lexists(path):
         raise ConfigError(f"{path} exists already; choose another path")
 
 

@@ -115,7 +115,7 @@ def test_play_says_whether_each_episode_succeeded(capsys):
         ("Tasks", None, [3, [], ["close_loop/none"], [1]]),
         ("Folders", "run", ["nope", [], ["nope"], 5, None, [1], LONG]),
         ("OutputFolder", "new", ["file", "file/x", "/proc/nope/x", "/dev/full/x", LONG]),
-        ("NewPath", "new.md", ["run", "file", "file/x", "/proc/nope/x", "/dev/full/x", LONG]),
+        ("NewPath", "new.md", ["run", "file", "link", "file/x", "/dev/full/x", LONG]),
         ("PngFile", "new.png", ["new.nope", "file/x.png", "folder.png"]),
         ("VideoFile", "new.GIF", ["new.avi", "/dev/full/x.mp4"]),
     ],
@@ -123,6 +123,7 @@ def test_play_says_whether_each_episode_succeeded(capsys):
 def test_types_of_settings(kind, right, wrong, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").write_text("a file")
+    (tmp_path / "link").symlink_to("nowhere")
     for name in ("run", "folder.png"):
         (tmp_path / name).mkdir()
     model = create_model("Settings", __base__=StrictModel, value=(getattr(types, kind), ...))
@@ -151,6 +152,7 @@ def test_a_small_shared_memory_is_refused(monkeypatch):
     [
         (KeyboardInterrupt(), "stopped by SIGINT\n"),
         (OSError(errno.ENOSPC, "No space left"), "error: [Errno 28] No space left\n"),
+        (OSError(errno.ENOTDIR, "Not a directory"), "error: [Errno 20] Not a directory\n"),
         (RuntimeError("x.safetensors: Too many open files (24)"), "error: [Errno 24] Too many "),
         (MemoryError("Unable to allocate 7 TiB"), "error: out of memory: Unable to"),
         (RuntimeError("can't allocate memory: you tried to\nallocate"), "error: out of memory: "),
