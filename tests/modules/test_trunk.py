@@ -67,19 +67,3 @@ def test_a_block_always_changes_the_action_if_negative_values_pass():
             differences.append(float((here - there).abs().max()))
     assert min(changes[0.1]) > 1e-4
     assert min(changes[0.0]) < min(changes[0.1])  # some narrow networks with a ReLU are blind
-
-
-@pytest.mark.parametrize("network", WIDTHS)
-def test_networks_compute_in_double_precision(network):
-    built = build(network)
-    depth, holding, action = scene(), torch.tensor([[False]]), torch.rand(1, 5)
-
-    def outputs(*modules, dtype):
-        actor, encoder, critic = (module.to(dtype) for module in modules)
-        image = depth.to(dtype)
-        return actor(image, holding)[0], critic(encoder(image, holding), action.to(dtype))
-
-    singles = outputs(*built, dtype=torch.float32)
-    for single, double in zip(singles, outputs(*built, dtype=torch.float64), strict=True):
-        assert double.dtype == torch.float64
-        torch.testing.assert_close(double.float(), single)

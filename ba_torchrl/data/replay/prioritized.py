@@ -183,7 +183,7 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         self._set(index, largest, storage)
 
     def _set(self, index: Any, priority: Tensor, storage: Storage | None = None) -> None:
-        if (torch.as_tensor(index) >= self._max_capacity).any():
+        if (torch.as_tensor(index, device="cpu") >= self._max_capacity).any():
             raise ValueError(
                 f"the storage holds more than max_capacity={self._max_capacity} transitions: give "
                 "the sampler the capacity of the storage"

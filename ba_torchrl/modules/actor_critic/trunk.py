@@ -100,7 +100,7 @@ class ImageTrunk(nn.Module):
 
     Activations are channels-last in the compute dtype; parameters stay float32 and each
     convolution casts its own filter. The result is float32. Vectors of the observation are appended
-    to it. Of images in float64, activations and result are float64.
+    to it.
 
     Args:
         convs: convolutions that take and return plain tensors in the input's dtype.
@@ -127,14 +127,12 @@ class ImageTrunk(nn.Module):
                 x = relu_of_max_pool(x, slope)
             else:
                 x = F.leaky_relu(x, slope) if slope else F.relu(x)
-        x = x.to(torch.promote_types(depth.dtype, torch.float32))
-        features = x.flatten(1).reshape(*leading, -1)
+        features = x.flatten(1).float().reshape(*leading, -1)
         return torch.cat([features, *vectors], dim=-1) if vectors else features
 
     def _input(self, depth: Tensor, holding: Tensor) -> Tensor:
         """Return the input of the first convolution [B, C', H, W], channels-last."""
         dtype = compute_dtype(self.config.precision, depth.device)
-        dtype = depth.dtype if depth.dtype == torch.float64 else dtype
         center, scale = self.config.depth_center_m, self.config.depth_scale_m
         if self.config.depth_reference == "floor":
             floor = depth.amax((-2, -1), keepdim=True)
