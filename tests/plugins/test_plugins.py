@@ -241,7 +241,7 @@ TRAINING = (
     "env.robot=mine/kuka",
     "env.obs_size=16",
     "env.max_steps=5",
-    "rotation=none",
+    "algorithm.rotation.name=none",
     "algorithm.batch_size=4",
     "demonstrations=2",
     "total_updates=4",
@@ -269,7 +269,7 @@ def test_the_recipes_take_a_plugin(folder):
     assert "over 2 episodes of mine/reach_near" in run(folder, *evaluate, PLUGIN).stdout
     done = run(folder, *evaluate, check=False)
     assert "runs/one/config.json uses the plugins [my_tasks,my_learning]" in done.stderr
-    assert f"add {PLUGIN}" in done.stderr
+    assert f"add '{PLUGIN}'" in done.stderr
 
     elsewhere = folder / "elsewhere"
     elsewhere.mkdir()
@@ -287,6 +287,7 @@ def test_a_benchmark_with_a_plugin_runs_its_jobs(folder):
         "networks=[mine/flat]",
         "seeds=1",
         "folder=grid",
+        "~network.precision",
         *(text for text in TRAINING if not text.startswith(("task=", "algorithm=", "network="))),
     ]
     out = run(folder, ROOT / "recipes" / "benchmark.py", *arguments).stdout
