@@ -1,8 +1,10 @@
-"""Draw the tasks: a picture and a film of each, and one picture of all, in new files.
+"""Draw the tasks: a picture and a film of each, and one picture of all.
 
 python recipes/gallery.py                       # in runs/gallery
 python recipes/gallery.py folder=docs/gallery overview=docs/gallery.png films=true
 python recipes/gallery.py 'tasks=[close_loop/block_picking]' folder=pictures overview=null
+
+A file that exists is refused: delete the pictures of a page before they are drawn again.
 """
 
 from __future__ import annotations
