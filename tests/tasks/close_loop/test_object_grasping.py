@@ -80,7 +80,7 @@ def test_the_expert_descends_while_it_moves_and_turns_near_the_object_only(make)
 @pytest.mark.parametrize(
     ("config", "least"),
     [
-        ({"num_objects": 15}, 0.88),  # 0.92 with two seeds
+        ({"num_objects": 15}, 0.88),  # 0.92, 0.90 and 0.98 with three seeds
         ({"object_set": "household"}, 0.88),  # 0.92, 0.92, 0.94 and 0.98 with four seeds
     ],
 )
