@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import locale
 import os
 import sys
 import tempfile
+import threading
 import weakref
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -161,7 +164,7 @@ class World:
         )
         pybullet.setGravity(0, 0, -self.physics.gravity_m_s2, physicsClientId=self.client)
         model = f"{pybullet_data.getDataPath()}/plane.urdf"
-        with loading(model):
+        with loading(model), decimal_point(self.client):
             self.floor = pybullet.loadURDF(model, physicsClientId=self.client)
         pybullet.changeDynamics(
             self.floor, -1, lateralFriction=self.physics.floor_friction, physicsClientId=self.client
@@ -178,7 +181,8 @@ class World:
     def add(self, shape: Shape, name: str) -> Body:
         """Load a body; possible only before `seal`."""
         self._check_not_sealed(name)
-        body = Body(self.client, shape, name)
+        with decimal_point(self.client):
+            body = Body(self.client, shape, name)
         self._register(body)
         return body
 
@@ -190,7 +194,8 @@ class World:
         Both links are added to `bodies`.
         """
         self._check_not_sealed(name)
-        body = ArticulatedBody(self.client, base, slider, joint, name)
+        with decimal_point(self.client):
+            body = ArticulatedBody(self.client, base, slider, joint, name)
         self._register(*body.parts)
         return body
 
@@ -386,6 +391,46 @@ def loading(path: str | os.PathLike[str]) -> Iterator[None]:
     except pybullet.error as error:
         with open(path, "rb"):
             raise SimulationError(f"PyBullet cannot load {path}: {error}") from error
+
+
+_process_locale = threading.RLock()
+"""Held while the locale of the process is changed."""
+
+
+@contextlib.contextmanager
+def decimal_point(client: int) -> Iterator[None]:
+    """A context in which PyBullet reads numbers in files with a decimal point.
+
+    Every robot, body and floor is loaded in it. PyBullet reads numbers as the locale says, which a
+    user, or a toolkit such as Qt, may have set to one with a decimal comma.
+
+    Without a window, PyBullet loads files in the calling thread, and only this thread's locale
+    changes. A window loads files in a thread of its own, so that the locale of the process changes,
+    as it does on systems where a thread has no locale.
+    """
+    libc = ctypes.CDLL(None)
+    has_window = pybullet.getConnectionInfo(client)["connectionMethod"] != pybullet.DIRECT
+    if has_window or not hasattr(libc, "uselocale"):
+        with _process_locale:
+            before = locale.setlocale(locale.LC_NUMERIC)
+            locale.setlocale(locale.LC_NUMERIC, "C")
+            try:
+                yield
+            finally:
+                locale.setlocale(locale.LC_NUMERIC, before)
+        return
+    for function in (libc.uselocale, libc.duplocale, libc.newlocale):
+        function.restype = ctypes.c_void_p
+    before = ctypes.c_void_p(libc.uselocale(None))
+    # of numbers alone, as a robot's code may read texts in the encoding of the locale
+    base = ctypes.c_void_p(libc.duplocale(before))
+    own = ctypes.c_void_p(libc.newlocale(1 << locale.LC_NUMERIC, b"C", base))
+    libc.uselocale(own)
+    try:
+        yield
+    finally:
+        libc.uselocale(before)
+        libc.freelocale(own)
 
 
 def connect_window() -> int:

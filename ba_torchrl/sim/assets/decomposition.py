@@ -36,7 +36,8 @@ VOXELS = 46
 VHACD_LIMIT_S = 900.0
 """Time limit of a decomposition, which takes seconds."""
 _VHACD_PROGRAM = (
-    "import json, sys, pybullet; pybullet.vhacd(*sys.argv[1:4], **json.loads(sys.argv[4]))"
+    "import json, locale, sys, pybullet; locale.setlocale(locale.LC_NUMERIC, 'C'); "
+    "pybullet.vhacd(*sys.argv[1:4], **json.loads(sys.argv[4]))"
 )
 
 

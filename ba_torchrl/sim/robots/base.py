@@ -27,7 +27,7 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.gripper import TIP_HEIGHT_M, Gripper
-from ba_torchrl.sim.world import World
+from ba_torchrl.sim.world import World, decimal_point
 
 GRASP_NORMAL_COSINE = 0.7
 """A contact contributes to a grasp if its normal is within 45 degrees of the closing axis."""
@@ -113,7 +113,8 @@ class Robot(ABC):
     def __init__(self, world: World) -> None:
         self.world = world
         self.client = world.client
-        self.id = self.load()
+        with decimal_point(self.client):
+            self.id = self.load()
         self.joints: list[float] = [0.0] * len(self.arm_joints)
         """Commanded arm joints."""
         self.commanded_opening = 1.0
