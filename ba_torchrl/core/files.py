@@ -5,7 +5,7 @@ the folder with it. No file of another type is opened, so that none can run code
 texts are ignored, and links to files are followed.
 
 `replaced` and `complete_only` give a file or folder its name when it is complete on the disk.
-`Lock` keeps other processes out (POSIX systems).
+`Lock` keeps other processes out, and `lock_holder` names the one inside (POSIX systems).
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ _TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"
 _CHUNK = 1 << 20
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 """Of file systems of networks that are mounted without locks."""
+_UNNAMED = "another process"
 
 logger = logging.getLogger(__name__)
 
@@ -163,7 +164,7 @@ class Lock:
                 pass
             except BlockingIOError:
                 self._file.seek(0)
-                holder = self._file.read() or "another process"
+                holder = self._file.read() or _UNNAMED
                 self._file.close()
                 raise ConfigError(f"{holder} {what}") from None
             except OSError as error:
@@ -186,6 +187,25 @@ class Lock:
         if not self._file.closed:
             self._path.unlink(missing_ok=True)
             self._file.close()
+
+
+def lock_holder(path: Path) -> str | None:
+    """Return the process that holds the lock of a file, such as "process 12 on a-host".
+
+    None if there is none, or if the file system has no locks.
+    """
+    try:
+        with path.open() as file:
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                return file.read() or _UNNAMED
+            except OSError as error:
+                if error.errno not in _NO_LOCKS:
+                    raise
+    except FileNotFoundError:
+        pass
+    return None
 
 
 def check(folder: str | Path) -> None:

@@ -10,7 +10,6 @@ in progress are replaced by episodes of other seeds.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import math
@@ -41,6 +40,7 @@ from ba_torchrl.core.files import (
     Lock,
     check,
     complete_only,
+    lock_holder,
     read_json,
     read_state,
     seal,
@@ -71,20 +71,9 @@ def lock_run(folder: Path) -> Lock:
     return Lock(folder / LOCK_FILE, f"runs the experiment in {folder}")
 
 
-def lock_holder(folder: Path) -> str | None:
-    """Return the process that runs the experiment in a folder, such as "process 12 on a-host".
-
-    None if there is none.
-    """
-    try:
-        with (folder / LOCK_FILE).open() as file:
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                return file.read() or "another process"
-    except FileNotFoundError:
-        pass
-    return None
+def run_holder(folder: Path) -> str | None:
+    """Return the process that runs the experiment in a folder; see `lock_holder`."""
+    return lock_holder(folder / LOCK_FILE)
 
 
 def open_run_folder(config: ExperimentConfig) -> None:
@@ -312,6 +301,7 @@ class Checkpoints:
         self._rotation = CheckpointRotation(
             folder / _CHECKPOINTS, keep_last=keep_last, keep_best=("success_rate", "max")
         )
+        self._rotation.prune()  # the process may have been killed after its last save
 
     def save(self, updates: int, success_rate: float) -> Path:
         """Write a checkpoint and return its folder."""

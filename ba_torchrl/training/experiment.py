@@ -74,11 +74,15 @@ class Experiment:
         self.algorithm = build_algorithm(config)
         if config.compile_mode is not None:
             self.algorithm.compile(config.compile_mode)
-        self._lock = lock_run(config.folder)
-        open_run_folder(config)
         self._greedy = acting_on(self.algorithm.policy, config.torch_device)
-        self.checkpoints = Checkpoints(config.folder, self.algorithm)
-        self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
+        self._lock = lock_run(config.folder)
+        try:
+            open_run_folder(config)
+            self.checkpoints = Checkpoints(config.folder, self.algorithm)
+            self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
+        except BaseException:  # a notebook keeps this object, with its lock, in the traceback
+            self._lock.release()
+            raise
         self._collection: Collection | None = None
         self._eval_env: EnvBase | None = None
         self.state = RunState()

@@ -19,6 +19,7 @@ from ba_torchrl.core.files import (
     Lock,
     check,
     complete_only,
+    lock_holder,
     read_json,
     read_state,
     replaced,
@@ -270,6 +271,9 @@ def test_a_file_system_without_locks_is_a_warning(code, is_usable, tmp_path, mon
     with stops, complete_only(tmp_path / "demos") as scratch:
         scratch.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["demos"] * is_usable
+    (tmp_path / "lock").touch()
+    with contextlib.nullcontext() if is_usable else pytest.raises(OSError, match="no lock"):
+        assert lock_holder(tmp_path / "lock") is None
     assert len(caplog.messages) == is_usable
 
 

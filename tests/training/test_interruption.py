@@ -13,7 +13,7 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
 from ba_torchrl.training import collection
 from ba_torchrl.training import experiment as experiments
-from ba_torchrl.training.checkpoint import Checkpoints, lock_holder, resumable_updates, saved_steps
+from ba_torchrl.training.checkpoint import Checkpoints, resumable_updates, run_holder, saved_steps
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
 from ba_torchrl.training.interruption import RunStopped
@@ -333,9 +333,9 @@ def test_an_evaluation_draws_nothing_from_the_process_generators(tmp_path):
 
 def test_a_running_run_cannot_be_opened_again(tmp_path):
     experiment = Experiment(config_for(tmp_path), progress=False)
-    assert lock_holder(tmp_path).startswith(f"process {os.getpid()} on ")
+    assert run_holder(tmp_path).startswith(f"process {os.getpid()} on ")
     with pytest.raises(ConfigError, match=f"process {os.getpid()} on .* runs the experiment"):
         Experiment(config_for(tmp_path, resume=True), progress=False)
     experiment.close()
-    assert lock_holder(tmp_path) is None
+    assert run_holder(tmp_path) is None
     Experiment(config_for(tmp_path, resume=True), progress=False).close()

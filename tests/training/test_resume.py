@@ -14,6 +14,7 @@ from ba_torchrl.training.checkpoint import (
     find_checkpoint,
     load,
     read_config,
+    saved_steps,
 )
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
@@ -88,18 +89,27 @@ def test_a_checkpoint_missing_after_an_interruption_is_written(tmp_path):
     assert find_checkpoint(config.folder).name.endswith("3")
 
 
-def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path, monkeypatch):
+def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path):
     config = config_for(tmp_path)
-    with monkeypatch.context() as patch:
-        patch.setattr(experiments, "plot_curve", raise_interrupted)
-        with pytest.raises(Interrupted):
-            run(config)
+    experiment = Experiment(config, progress=False)
+    rotation, kept = experiment.checkpoints._rotation, []
+
+    def prune():
+        kept.append(len(saved_steps(rotation.directory)))
+        if len(kept) == 3:
+            raise Interrupted
+
+    rotation.prune = prune
+    with pytest.raises(Interrupted):
+        experiment.run()
+    assert kept == [1, 2, 3]
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
     experiment.algorithm.update = None
     assert experiment.run().updates == 9
     result = read_result(config.folder)
     assert [point.updates for point in result.curve] == [0, 3, 6, 9]
     assert result.resumed_at == [9]
+    assert len(saved_steps(rotation.directory)) == 2
 
 
 def test_a_run_interrupted_before_its_first_state_starts_again(tmp_path, caplog, monkeypatch):
@@ -184,9 +194,10 @@ def test_a_run_begun_on_cuda_resumes_on_a_cpu(tmp_path, monkeypatch, caplog):
 
 def test_a_folder_with_a_run_is_not_overwritten(interrupted, tmp_path):
     config = interrupted
-    with pytest.raises(ConfigError, match="resume=true continues"):
+    with pytest.raises(ConfigError, match="resume=true continues") as refused:
         Experiment(config, progress=False)
     run(config_for(tmp_path, resume=True))
+    del refused  # which keeps the experiment, as a notebook does
     before = (config.folder / "result.json").read_bytes()
     for resume in (False, True):
         with pytest.raises(ConfigError, match="finished run"):

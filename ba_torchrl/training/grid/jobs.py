@@ -22,7 +22,7 @@ from tqdm import tqdm
 from ba_torchrl.core.files import write_text
 from ba_torchrl.record.logging import FILE_INTERVAL_S, last_step
 from ba_torchrl.record.results import FAILURE_FILE, now
-from ba_torchrl.training.checkpoint import lock_holder
+from ba_torchrl.training.checkpoint import run_holder
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import status
 
@@ -75,7 +75,7 @@ def run_all(
         while waiting or running:
             while waiting and len(running) < jobs:
                 run = waiting.popleft()
-                holder = lock_holder(run.folder)
+                holder = run_holder(run.folder)
                 if holder is None:
                     running.append(_Job(run, worker, max_hours))
                 else:
@@ -186,7 +186,7 @@ class _Job:
         code = self._process.returncode
         if status(self.run).state == "done":
             return None
-        holder = lock_holder(self.run.folder)
+        holder = run_holder(self.run.folder)
         if holder is not None and not holder.startswith(f"process {self._process.pid} "):
             _report_skipped(self.run, holder)  # which started at the same time
             return None

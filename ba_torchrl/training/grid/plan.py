@@ -210,10 +210,10 @@ def status(run: ExperimentConfig) -> Status:
     """Return the state of a run. One whose files are damaged has failed."""
     from ba_torchrl.training.checkpoint import (
         check_same_run,
-        lock_holder,
         parse_saved,
         read_config,
         resumable_updates,
+        run_holder,
     )
 
     folder = run.folder
@@ -233,7 +233,7 @@ def status(run: ExperimentConfig) -> Status:
         except ConfigError as error:
             return Status("failed", f"{error}; delete the folder to start the run again")
         check_same_run(run, started)
-    holder = lock_holder(folder)
+    holder = run_holder(folder)
     if holder is not None:
         return Status("running", holder)
     reason = read_failure(folder)
