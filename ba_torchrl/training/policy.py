@@ -17,7 +17,7 @@ from typing import Any, Literal
 import torch
 from pydantic import Field, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load_file
+from safetensors.torch import load as load_tensors
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -28,7 +28,7 @@ from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import StrictModel, explain
-from ba_torchrl.core.errors import ConfigError, UnknownNameError, check_choice
+from ba_torchrl.core.errors import ConfigError, DamagedFilesError, UnknownNameError, check_choice
 from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
@@ -81,9 +81,12 @@ _WAY_OUT = "policy.make_env(), or a command without env.*, makes the environment
 class PolicyCard(StrictModel):
     """What is known of a policy in a file."""
 
-    format: Literal[4] = 4
+    format: Literal[5] = 5
     """1: kernels whose signs depended on the CPU. 2: no versions, and episodes of other seeds. 3: a
-    configuration of another form."""
+    configuration of another form. 4: no checksum of the weights."""
+    policy_file: str
+    """SHA-256 of the file of the weights. Card and weights get their names one after the other, and
+    are copied separately."""
     task: str
     task_version: int
     """Of the training and of the episodes."""
@@ -274,8 +277,8 @@ def load_policy(
         its environment. A warning says if it was trained in another version of its task.
 
     Raises:
-        ConfigError: there is no such policy, its files are damaged, or it names plugins that are
-            neither imported nor installed.
+        ConfigError: there is no such policy, its files are damaged or do not belong together, or it
+            names plugins that are neither imported nor installed.
     """
     check_choice("which", which, Which)
     changes = {**_OF_TRAINING, "device": str(device), **changes}
@@ -296,12 +299,21 @@ def load_policy(
         _warn_of_version(config.task, versions)
         return TrainedPolicy(algorithm, config, algorithm.updates, checkpoint, versions)
     card = read_card(path)
+    try:
+        weights = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    if sha256(weights).hexdigest() != card.policy_file:
+        raise DamagedFilesError(
+            f"{path} does not have the weights of its card, {path.with_suffix(CARD).name}: copy "
+            "both files again, or export the policy again"
+        )
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
     config = parse_saved(card.config, path.with_suffix(CARD), **changes)
     learner = build_to_load(config)
     try:
-        learner.policy.load_state_dict(load_file(path, device=str(config.torch_device)))
-    except (OSError, RuntimeError, SafetensorError) as error:
+        learner.policy.load_state_dict(load_tensors(weights))
+    except (RuntimeError, SafetensorError) as error:
         reason = textwrap.shorten(str(error), 300)
         raise ConfigError(f"{path} does not hold the policy of its card: {reason}") from None
     versions = Versions(card.task_version, card.expert_version)
@@ -364,16 +376,6 @@ def save_policy(policy: TrainedPolicy, path: str | Path, test: TestedPolicy) -> 
     words = [f"policy={source}", f"episodes={test.episodes}"]
     if policy.config.plugins:
         words.append(f"plugins=[{','.join(policy.config.plugins)}]")
-    card = PolicyCard(
-        task=policy.task,
-        task_version=policy.versions.task,
-        label=policy.config.label,
-        config=config,
-        updates=policy.updates,
-        **_of_test(test, PROTOCOL, precision(policy.config)),
-        evaluate=shlex.join(["ba-torchrl", "evaluate", *words]),
-        **run,
-    )
     tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}
     with complete_only(path, replace=True) as scratch:
         write_tensors(
@@ -384,6 +386,17 @@ def save_policy(policy: TrainedPolicy, path: str | Path, test: TestedPolicy) -> 
             },
         )
         scratch.chmod(0o644)  # safetensors makes it readable for its owner alone
+        card = PolicyCard(
+            policy_file=sha256(scratch.read_bytes()).hexdigest(),
+            task=policy.task,
+            task_version=policy.versions.task,
+            label=policy.config.label,
+            config=config,
+            updates=policy.updates,
+            **_of_test(test, PROTOCOL, precision(policy.config)),
+            evaluate=shlex.join(["ba-torchrl", "evaluate", *words]),
+            **run,
+        )
         write_text(scratch.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
     return card
 
@@ -424,7 +437,7 @@ def policy_result(policy: TrainedPolicy, test: TestedPolicy) -> RunResult:
         curve=[],
         last=test,
         best=test,
-        policy_file=sha256(policy.source.read_bytes()).hexdigest(),
+        policy_file=card.policy_file,
         demonstrations=card.demonstrations,
         demonstration_steps=card.demonstration_steps,
         env_steps=card.env_steps,

@@ -1,6 +1,7 @@
 """Trained policies: from a run, in a file with its card, and shipped."""
 
 import json
+import os
 import re
 import shlex
 import shutil
@@ -242,9 +243,31 @@ def test_what_is_no_policy_is_named(run, tmp_path):
         loaded(config={**saved["config"], "new": 1})
     with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*format: "):
         loaded(format=1)
+    wider = {**saved["config"]["network"], "width": 2 * saved["config"]["network"]["width"]}
+    with pytest.raises(ConfigError, match="does not hold the policy of its card"):
+        loaded(config={**saved["config"], "network": wider})
     loaded()
     path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match="does not hold the policy of its card"):
+    with pytest.raises(ConfigError, match=r"weights of its card, p.json: copy both"):
+        ba_torchrl.load_policy(path)
+
+
+def test_weights_and_card_of_two_exports_are_told_apart(run, tmp_path, monkeypatch):
+    """The process ends between the two renames, or somebody copies one file."""
+    path, policy = tmp_path / "p.safetensors", ba_torchrl.load_policy(run)
+    policies.save_policy(policy, path, with_outcomes(1))
+    next(iter(policy.policy.parameters())).add_(1)
+
+    def replace(source, target, replace=os.replace):
+        if source.suffix == policies.TENSORS:
+            raise KeyboardInterrupt
+        replace(source, target)
+
+    monkeypatch.setattr("ba_torchrl.core.files.os.replace", replace)
+    with pytest.raises(KeyboardInterrupt):
+        policies.save_policy(policy, path, with_outcomes(0))
+    assert policies.read_card(path).success_rate == 0
+    with pytest.raises(ConfigError, match="does not have the weights of its card"):
         ba_torchrl.load_policy(path)
 
 
