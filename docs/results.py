@@ -41,6 +41,7 @@ from ba_torchrl.record.summary import (
     pipes,
 )
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.policy import read_card, shipped_file
 from ba_torchrl.training.protocol import PROTOCOL
 from docs.sources import ROOT
 
@@ -105,13 +106,21 @@ def page_with_results(text: str) -> str:
 
 
 def _question(section: Section) -> Iterator[str]:
-    """Yield the lines of the answer to a question; differences are those to each task's best."""
+    """Yield the lines of the answer to a question.
+
+    Differences are those to each task's best method, and all whose interval excludes zero.
+    """
     yield f"![Success over environment steps](results/{section.title}.svg)\n"
     rows = (_compared_cells(group, section.end(group.task)) for group in section.groups)
     yield from pipes(COMPARED, *rows)
     yield ""
     best = {group.task: group for group in sorted(section.groups, key=lambda group: group.success)}
-    rows = (row for row in compare(section) if _has(row, best[str(row["task"])].method))
+    rows = (
+        row
+        for row in compare(section)
+        if row["task"] in best
+        and (_has(row, best[row["task"]].method) or row["low"] > 0 or row["high"] < 0)
+    )
     yield from pipes(DIFFERENCES, *map(_difference, rows))
     yield ""
     yield _origin([run for group in section.groups for run in group.runs])
@@ -149,8 +158,22 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
         yield f"### {heading}\n"
         yield from pipes(HEADER, *(row for task in tasks for row in _rows(board, task)))
         yield ""
-    if board.groups:
-        yield _origin([run for group in board.groups for run in group.runs])
+    runs = [run for group in board.groups for run in group.runs]
+    if runs:
+        yield from _trained(runs)
+        yield f"Tests of policies: {_origin(runs)}"
+
+
+def _trained(runs: Sequence[Run]) -> Iterator[str]:
+    """Yield where the policies of records were trained, and what their cards do not know."""
+    files = {shipped_file(run.result.task): run for run in runs if run.result.policy_file}
+    cards = [read_card(file) for file in files]
+    for cpu in sorted({card.hardware["cpu"] for card in cards}):
+        of_cpu = [card for card in cards if card.hardware["cpu"] == cpu]
+        commits = sorted({card.versions["commit"] for card in of_cpu})
+        yield f"Trained on {cpu}: {len(of_cpu)} policies; commits: {', '.join(commits)}.\n"
+    if unknown := [f"`{card.task}`" for card in cards if card.demonstrations is None]:
+        yield f"Demonstrations and expert labels were not recorded for {', '.join(unknown)}.\n"
 
 
 def plot_tasks(board: Leaderboard, path: Path) -> None:
