@@ -28,7 +28,7 @@ from ba_torchrl.record.leaderboard import (
     read_records,
     success_text,
 )
-from ba_torchrl.record.plots import save
+from ba_torchrl.record.plots import own_style, save
 from ba_torchrl.record.report import plot_groups
 from ba_torchrl.record.summary import (
     GOOD_RATE,
@@ -176,6 +176,7 @@ def _trained(runs: Sequence[Run]) -> Iterator[str]:
         yield f"Demonstrations and expert labels were not recorded for {', '.join(unknown)}.\n"
 
 
+@own_style()
 def plot_tasks(board: Leaderboard, path: Path) -> None:
     """Plot the success of each task's best method with its interval beside that of the expert.
 

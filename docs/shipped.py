@@ -12,9 +12,9 @@ from pathlib import Path
 
 from ba_torchrl import load_policy
 from ba_torchrl.commands.evaluate import EpisodeSettings, play
-from ba_torchrl.core.files import json_bytes, write_text
+from ba_torchrl.core.files import write_text
 from ba_torchrl.record.leaderboard import RECORDS
-from ba_torchrl.record.results import RunResult
+from ba_torchrl.record.results import read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.policy import (
     CARD,
@@ -49,7 +49,7 @@ def is_recorded(task: str) -> bool:
     file = record_file(task)
     if not file.exists():
         return False
-    record = RunResult.model_validate_json(json_bytes(file))
+    record = read_result(file)
     digest = sha256(shipped_file(task).read_bytes()).hexdigest()
     found = record.policy_file, record.task_version, record.protocol
     return record.last.is_citable and found == (digest, TASKS[task].version, PROTOCOL)

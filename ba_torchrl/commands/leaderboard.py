@@ -11,10 +11,11 @@ from ba_torchrl import list_tasks
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, PluginSettings
 from ba_torchrl.commands.report import completed
+from ba_torchrl.core.config import PROTOCOL
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.leaderboard import LEGEND, leaderboard, read_records
 from ba_torchrl.record.results import why_unfinished
-from ba_torchrl.record.summary import load_runs, pipes
+from ba_torchrl.record.summary import load_runs, markdown, pipes
 
 
 class Settings(PluginSettings):
@@ -27,8 +28,6 @@ class Settings(PluginSettings):
 def main(settings: Settings) -> None:
     """Print the table."""
     records, roots = read_records(), settings.runs or ()
-    from ba_torchrl.training.protocol import PROTOCOL  # imports torch, which takes seconds
-
     own, unfinished = load_runs(roots)
     if roots and not own and not unfinished:
         raise ConfigError(f"no run below {', '.join(roots)}")
@@ -40,7 +39,7 @@ def main(settings: Settings) -> None:
     print(f"\n{LEGEND}")
     left_out = [*board.left_out, *(f"{folder}: {why_unfinished(folder)}" for folder in unfinished)]
     if left_out:
-        print("\n".join(["\nLeft out:", *(f"- {run}" for run in left_out)]))
+        print("\n".join(["\nLeft out:", *(f"- {markdown(run)}" for run in left_out)]))
 
 
 COMMAND = Command(main, Settings, positional="runs")

@@ -2,12 +2,14 @@
 
 ba-torchrl report runs/
 ba-torchrl report 'runs=[runs/close_loop_3d,runs/close_loop_4d]' folder=report axis=updates
+ba-torchrl report runs/mine 'plugins=[my_tasks]'
 """
 
 from __future__ import annotations
 
 import contextlib
 import functools
+import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -17,10 +19,10 @@ from hydra import compose
 from omegaconf import OmegaConf
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Folders, OutputFolder, check_writable_folder
+from ba_torchrl.cli.types import Folders, OutputFolder, PluginSettings, check_writable_folder
 from ba_torchrl.commands import benchmark as benchmark_command
-from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.plugins import check_known
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import NON_LEARNING_FIELDS, RESULT_FILE, RunResult, differences
 from ba_torchrl.record.summary import Axis, Run, load_runs, sections
@@ -28,8 +30,13 @@ from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import expand, split
 
+logger = logging.getLogger(__name__)
 
-class Settings(StrictModel):
+_NOT_OPENED = {"demonstrations_path": None, "demonstrations_mapping": None, "logger": "csv"}
+"""Settings of a run that name files or packages of its machine, with values that name none."""
+
+
+class Settings(PluginSettings):
     """Settings of this command."""
 
     runs: Folders = "runs"
@@ -59,14 +66,28 @@ def main(settings: Settings) -> None:
 def completed(runs: Iterable[Run]) -> list[Run]:
     """Return runs with the defaults of settings that are newer than they are.
 
-    A run whose settings this version does not know is returned as it is.
+    A run is returned as it is if this version does not know its settings, or if it names plugins
+    that are not imported, which a warning says. The files that its settings name are not opened.
     """
-    found = []
+    from ba_torchrl.training.checkpoint import parse_saved  # imports torch, which takes seconds
+
+    found: list[Run] = []
+    reasons: dict[str, ConfigError] = {}
     for run in runs:
+        config, result = run.result.config, run.result
+        try:
+            check_known(config.get("plugins"), run.folder)
+        except ConfigError as error:
+            reasons.setdefault(str(config["plugins"]), error)
+            found.append(run)
+            continue
         with contextlib.suppress(ConfigError):
-            config = ExperimentConfig.parse({**run.result.config, "device": "cpu"}).resolved()
-            run = replace(run, result=run.result.model_copy(update={"config": config}))
+            known = parse_saved(config, run.folder, device="cpu", **_NOT_OPENED).resolved()
+            known |= {name: config[name] for name in _NOT_OPENED if name in config}
+            run = replace(run, result=result.model_copy(update={"config": known}))
         found.append(run)
+    for reason in reasons.values():
+        logger.warning("settings are as the run saved them: %s", reason)
     return found
 
 

@@ -220,6 +220,8 @@ FIRST_TEST_SEED = 9 * 10**15
 """Seed of the first episode of a test; see `ba_torchrl.training.protocol`. It is exact as a number
 of JSON, below 2**53. Its upper 32 bits are above two million: NumPy's seeds [a + 2**32 b, 0] and
 [a, b] give the same numbers, those of episode b of seed a."""
+PROTOCOL = 1
+"""Version of the protocol of tests; rises when the numbers of the same policies change."""
 
 
 class TaskParameters(StrictModel):

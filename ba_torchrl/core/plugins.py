@@ -113,11 +113,13 @@ def load_plugins(names: Iterable[str]) -> None:
     import_modules(names)
 
 
-def check_known(names: Iterable[str], file: str | Path) -> None:
+def check_known(names: object, file: str | Path) -> None:
     """Raise `ConfigError` unless this process has imported the plugins that a file names, which may
-    come from somebody else, or an installed package declares them. None is imported."""
+    come from somebody else, or an installed package declares them. None is imported, and what is no
+    list is left to the model of the settings."""
     installed = {point.module for point in entry_points(group=GROUP)}
-    unknown = [name for name in names if name not in sys.modules and name not in installed]
+    listed = map(str, names) if isinstance(names, list) else ()
+    unknown = [name for name in listed if name not in sys.modules and name not in installed]
     if unknown:
         listed = ",".join(unknown)
         raise ConfigError(

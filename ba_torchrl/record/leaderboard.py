@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 from importlib.resources import files
 from pathlib import Path
 
-from ba_torchrl.core.files import json_bytes
-from ba_torchrl.record.results import CITABLE_EPISODES, RunResult
+from ba_torchrl.record.results import CITABLE_EPISODES, RunResult, read_result
 from ba_torchrl.record.summary import DIRECTION, ENOUGH_SEEDS, Group, Run, grouped
 from ba_torchrl.tasks.base import TASKS
 
@@ -56,7 +55,7 @@ def success_text(group: Group) -> str:
 def read_records(folder: Path | None = None) -> list[Run]:
     """Read the records in a folder, a JSON file each; by default those of the package."""
     files = sorted((folder or RECORDS).glob("*.json"))
-    return [Run(path, RunResult.model_validate_json(json_bytes(path))) for path in files]
+    return [Run(path, read_result(path)) for path in files]
 
 
 def leaderboard(
@@ -91,7 +90,10 @@ def leaderboard(
 def _unfit(result: RunResult, tasks: Sequence[str], protocol: int) -> list[str]:
     """Return why a run does not belong to the table."""
     if result.task not in tasks:
-        return ["its task is not registered; name its plugins"]
+        names = result.config.get("plugins")
+        named = ",".join(map(str, names)) if isinstance(names, list) else ""
+        way_out = f"if you trust them, add 'plugins=[{named}]'" if named else "name its plugins"
+        return [f"its task is not registered; {way_out}"]
     task = TASKS[result.task]
     numbers = [
         ("task version", result.task_version, task.version),

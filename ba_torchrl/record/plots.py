@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from matplotlib import rc_context
+from matplotlib import rc_context, rcdefaults, rcParams
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure  # no pyplot: it holds figures in a global list
 from matplotlib.lines import Line2D
@@ -38,6 +39,17 @@ class Learning(NamedTuple):
     """Length of a dotted line to the left of 0."""
 
 
+@contextmanager
+def own_style() -> Iterator[None]:
+    """Context, also a decorator, of every figure: the user's matplotlibrc has no effect in it, and
+    a dollar sign is one, not the begin of a formula."""
+    with rc_context():
+        rcdefaults()
+        rcParams["text.parse_math"] = False
+        yield
+
+
+@own_style()
 def plot_panels(
     panels: Mapping[str, Mapping[str, Learning]],
     paths: Sequence[str | Path],
@@ -96,10 +108,12 @@ def plot_panels(
         save(figure, path)
 
 
+@own_style()
 def save(figure: Figure, path: Path) -> None:
     """Write a figure, to the same file for the same content."""
     metadata = {"Date": None} if path.suffix == ".svg" else None
-    with rc_context({"svg.hashsalt": path.stem}), replaced(path) as scratch:
+    rcParams["svg.hashsalt"] = path.stem
+    with replaced(path) as scratch:
         figure.savefig(scratch, metadata=metadata)
 
 

@@ -7,7 +7,9 @@ A folder with a page (HTML), curves (SVG, PDF), tables (CSV, Markdown), values a
 from __future__ import annotations
 
 import csv
+import itertools
 import os
+import re
 import shutil
 from collections.abc import Iterable, Iterator, Sequence
 from importlib.resources import files
@@ -19,7 +21,7 @@ from jinja2 import Environment
 
 from ba_torchrl.core.files import replaced, write_text
 from ba_torchrl.record.plots import Learning, plot_panels
-from ba_torchrl.record.results import CITABLE_EPISODES, now, why_unfinished
+from ba_torchrl.record.results import CITABLE_EPISODES, file_of, now, why_unfinished
 from ba_torchrl.record.statistics import CONFIDENCE
 from ba_torchrl.record.summary import (
     DIRECTION,
@@ -32,9 +34,11 @@ from ba_torchrl.record.summary import (
     Section,
     compare,
     differing_settings,
+    markdown,
     pipes,
     summarize,
 )
+from ba_torchrl.record.video import VIDEO_SUFFIXES
 
 
 class _Column(NamedTuple):
@@ -81,6 +85,8 @@ _COMPARISONS = (
 )
 _SETTINGS = _texts("setting", "value", "methods")
 _FORMATS = (".svg", ".pdf")
+_NAME_BYTES = 180
+"""Longest name of a file before a seed and a suffix; file systems allow 255 bytes."""
 _DEFINITIONS = (
     "Success: mean over seeds of the success rates of the last policies in their test episodes, of "
     "the greedy policy; for all tasks the mean over tasks. Best: of the checkpoints with the best "
@@ -113,7 +119,10 @@ def write_report(
         f"{Path(os.path.relpath(path, folder)).as_posix()}: {why_unfinished(path)}"
         for path in unfinished
     ]
-    parts = [_part(section, folder, axis) for section in sections]
+    stems = _file_names(section.title for section in sections)
+    parts = [
+        _part(section, stem, folder, axis) for section, stem in zip(sections, stems, strict=True)
+    ]
     runs = [
         ({"benchmark": section.title, "task": group.task, "method": group.method}, run)
         for section in sections
@@ -134,10 +143,11 @@ def write_report(
         with replaced(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
             writer.writeheader()
-            writer.writerows(rows)
+            writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
     texts = [_DEFINITIONS, *map(_markdown, parts)]
     if left_out:
-        texts.append("\n".join(["## Not finished", "", *(f"- {run}" for run in left_out)]))
+        listed = (f"- {markdown(run)}" for run in left_out)
+        texts.append("\n".join(["## Not finished", "", *listed]))
     write_text(folder / "table.md", "\n\n".join(texts) + "\n")
     template = files("ba_torchrl.record").joinpath("report.html").read_text(encoding="utf-8")
     page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
@@ -192,11 +202,11 @@ def plot_groups(
     plot_panels(panels, paths, names=names, xlabel=xlabel, columns=columns)
 
 
-def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
-    """Draw the figures of a section; return what the texts have of it."""
-    name = _file_name(section.title)
+def _part(section: Section, name: str, folder: Path, axis: Axis) -> dict[str, Any]:
+    """Draw the figures of a section, whose files have a name; return what the texts have of it."""
     plot_groups(section.groups, [folder / f"{name}{end}" for end in _FORMATS], axis)
-    panels = {task: f"{name}/{_file_name(task)}" for task in section.tasks}
+    names = zip(section.tasks, _file_names(section.tasks), strict=True)
+    panels = {task: f"{name}/{stem}" for task, stem in names}
     for task, stem in panels.items():
         paths = [folder / f"{stem}{end}" for end in _FORMATS]
         plot_groups(section.of_task(task), paths, axis, section.methods)
@@ -210,7 +220,7 @@ def _part(section: Section, folder: Path, axis: Axis) -> dict[str, Any]:
             _Table("Comparisons", _COMPARISONS, compare(section)),
             _Table("Settings in which methods differ", _SETTINGS, differing_settings(section)),
         ],
-        "videos": _videos(section, folder),
+        "videos": _videos(section, name, folder),
         "machines": sorted({_machine(run) for group in section.groups for run in group.runs}),
     }
 
@@ -243,14 +253,24 @@ def _final(run: Run) -> dict[str, Any]:
     }
 
 
+def _cell(value: object) -> object:
+    """Return a cell of a CSV file: a number, or a text that no spreadsheet takes for a formula."""
+    if value is None or isinstance(value, int | float):
+        return value
+    is_formula = str(value).lstrip().startswith(("=", "+", "-", "@"))
+    return f"'{value}" if is_formula else str(value)
+
+
 def _markdown(part: dict[str, Any]) -> str:
-    paragraphs = [f"## {part['title']}", *(f"**{text}**" for text in part["warnings"])]
+    warnings = (f"**{markdown(text)}**" for text in part["warnings"])
+    paragraphs = [f"## {markdown(part['title'])}", *warnings]
     for table in part["tables"]:
         if table.rows:
             cells = ([column.cell(row) for column in table.columns] for row in table.rows)
             headings = [column.heading for column in table.columns]
             paragraphs += [f"{table.title}:", "\n".join(pipes(headings, *cells))]
-    return "\n\n".join([*paragraphs, "\n".join(f"- {machine}" for machine in part["machines"])])
+    machines = (f"- {markdown(machine)}" for machine in part["machines"])
+    return "\n\n".join([*paragraphs, "\n".join(machines)])
 
 
 def _machine(run: Run) -> str:
@@ -263,23 +283,34 @@ def _machine(run: Run) -> str:
     return f"{where}, {hardware.get('threads')} threads; {packages}"
 
 
-def _videos(section: Section, folder: Path) -> list[dict[str, Any]]:
+def _videos(section: Section, stem: str, folder: Path) -> list[dict[str, Any]]:
     """Copy the videos; return their files by seed for each group that has some."""
+    groups = [(group.task, group.method) for group in section.groups]
+    names = dict(zip(groups, _file_names(map(" ".join, groups)), strict=True))
     found = []
     for group in section.groups:
         files = {}
         for run in group.runs:
-            source = run.folder / run.result.files.get("video", "")
-            if source.is_file():
-                name = _file_name(f"{group.task} {group.method} seed{run.result.seed}")
-                name = f"videos/{_file_name(section.title)}/{name}{source.suffix}"
-                with replaced(folder / name) as scratch:
+            source = file_of(run.folder, run.result, "video")
+            if source is not None and source.suffix.lower() in VIDEO_SUFFIXES:
+                name = f"{names[group.task, group.method]}_seed{run.result.seed}{source.suffix}"
+                with replaced(folder / "videos" / stem / name) as scratch:
                     shutil.copyfile(source, scratch)
-                files[run.result.seed] = name
+                files[run.result.seed] = f"videos/{stem}/{name}"
         if files:
             found.append({"caption": f"{group.task}, {group.method}", "files": files})
     return found
 
 
-def _file_name(title: str) -> str:
-    return "".join(c if c.isalnum() or c in "-_" else "_" for c in title)
+def _file_names(titles: Iterable[str]) -> list[str]:
+    """Return a name of files for each title; no two are the same, also if case is ignored."""
+    names: dict[str, str] = {}
+    for title in titles:
+        text = re.sub(r"[^\w-]", "_", title) or "_"
+        stem = name = os.fsencode(text)[:_NAME_BYTES].decode(errors="ignore")
+        for number in itertools.count(2):
+            if name.casefold() not in names:
+                break
+            name = f"{stem}-{number}"
+        names[name.casefold()] = name
+    return list(names.values())

@@ -1,24 +1,27 @@
 """Results of finished runs, one ``result.json`` per run folder.
 
-`RunResult` is the schema. Reports are made from these files only.
+`RunResult` is the schema. Reports are made from these files only, which somebody else may have
+written: `read_result` reads them all, imports nothing, and refuses what no run can have.
 """
 
 from __future__ import annotations
 
 import contextlib
+import os
 import platform
 import subprocess
 from collections.abc import Collection, Iterable, Mapping
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import Any, ClassVar, Literal
+from pathlib import Path, PurePosixPath
+from typing import Annotated, Any, ClassVar, Literal
 
-from pydantic import Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
 
 from ba_torchrl import __version__
-from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.config import FIRST_TEST_SEED, MAX_SEED, PROTOCOL, StrictModel, explain
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import json_bytes, read_json, write_text
 
 RESULT_FILE = "result.json"
@@ -29,6 +32,10 @@ CITABLE_EPISODES = 200
 """Least number of test episodes of a number that can be cited."""
 Phase = Literal["demonstrations", "collection", "updates", "evaluation", "other"]
 """Phase of a run. "other" is the start, the saving of states, and the video."""
+Count = Annotated[int, Field(ge=0, lt=2**53)]
+"""A number of something; larger ones are not exact in JSON."""
+Rate = Annotated[float, Field(ge=0, le=1)]
+Amount = Annotated[float, Field(ge=0)]
 PACKAGES = ("torch", "torchrl", "tensordict", "pybullet", "numpy", "escnn")
 
 NON_LEARNING_FIELDS = frozenset(
@@ -58,17 +65,17 @@ and reports average over runs that differ in them."""
 class CurvePoint(StrictModel):
     """One evaluation of the greedy policy during the run."""
 
-    updates: int
+    updates: Count
     """Gradient updates so far."""
-    env_steps: int
+    env_steps: Count
     """Steps of all environments so far, demonstrations not counted."""
-    seconds: float
+    seconds: Amount
     """Duration of the run so far, without interruptions."""
-    episodes: int
-    success_rate: float
-    standard_error: float
+    episodes: Annotated[Count, Field(ge=1)]
+    success_rate: Rate
+    standard_error: Rate
     """Binomial standard error of the success rate over these episodes."""
-    mean_length: float
+    mean_length: Amount
     """Mean steps per episode, failed episodes included."""
 
 
@@ -77,13 +84,13 @@ class TestedPolicy(StrictModel):
 
     __test__: ClassVar[bool] = False  # no test of pytest
 
-    updates: int
+    updates: Count
     """Gradient updates of the policy."""
-    seeds: list[int]
+    seeds: list[Annotated[int, Field(ge=0, lt=2**63)]]
     """Seed of each episode. Episodes with the same seed share their objects, and are a cluster."""
     successes: list[Literal[0, 1]]
     """Whether each episode reached the goal."""
-    lengths: list[int]
+    lengths: list[Annotated[Count, Field(ge=1)]]
     """Steps of each episode."""
 
     @model_validator(mode="after")
@@ -122,17 +129,17 @@ class RunResult(StrictModel):
 
     format: Literal[3] = 3
     """1: rates without the outcomes of episodes. 2: a configuration of another form."""
-    protocol: int
+    protocol: Count
     """Version of the protocol of the tests; see `ba_torchrl.training.protocol`."""
     task: str
-    task_version: int
-    expert_version: int | None
+    task_version: Count
+    expert_version: Count | None
     """None: no expert took part in the training, or it is unknown which."""
     label: str
     """Name of the method, such as "sacfd equi"."""
     benchmark: str | None
     """The benchmark that the run belongs to."""
-    seed: int
+    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     curve: list[CurvePoint]
     """Evaluations in the order of updates, the first of the untrained policy."""
     last: TestedPolicy
@@ -141,18 +148,18 @@ class RunResult(StrictModel):
     """The checkpoint with the best evaluation in `curve`, the newest of equal ones."""
     policy_file: str | None = None
     """SHA-256 of the file of the tested policy; None for a run."""
-    demonstrations: int | None
+    demonstrations: Count | None
     """Episodes of demonstrations."""
-    demonstration_steps: int | None
+    demonstration_steps: Count | None
     """Steps of these episodes."""
-    env_steps: int | None
+    env_steps: Count | None
     """Steps of all environments, demonstrations and evaluations not counted."""
-    expert_labels: int | None
+    expert_labels: Count | None
     """States besides demonstrations that the expert labelled with its action."""
     precision: str
     """Number format in which the networks compute, "float32", "bfloat16" or "tf32"; "bfloat16, then
     float32" of a run that was resumed on another machine."""
-    parameters: int
+    parameters: Count
     """Parameters of the acting policy."""
     config: dict[str, Any]
     """The run's configuration, defaults included."""
@@ -160,17 +167,50 @@ class RunResult(StrictModel):
     """Versions of Python and the packages, and the commit."""
     hardware: dict[str, Any]
     """`cpu`, `cores`, `memory_gb`, `gpu` (None on the CPU) and the learner's `threads`."""
-    seconds: float | None
+    seconds: Amount | None
     """Wall time of the run, without interruptions."""
-    phase_seconds: dict[Phase, float]
+    phase_seconds: dict[Phase, Amount]
     """What `seconds` is the sum of. Collection in other processes during updates is not counted."""
-    resumed_at: list[int] = Field(default_factory=list)
+    resumed_at: list[Count] = Field(default_factory=list)
     """Updates after which the run was resumed."""
     finished: str
     """Time of the end of the run, UTC, ISO 8601."""
     files: dict[str, str]
-    """Paths of `curve`, `checkpoint` of the last policy, the `best` one and optionally `video`,
-    relative to the run folder."""
+    """Paths of the `checkpoint` of the last policy, the `best` one, and the `curve` and the `video`
+    if they could be made, relative to the run folder and inside it."""
+
+    @field_validator("curve")
+    @classmethod
+    def _check_order(cls, curve: list[CurvePoint]) -> list[CurvePoint]:
+        updates = [point.updates for point in curve]
+        if updates != sorted(set(updates)):
+            raise ValueError("the updates of the points do not rise")
+        return curve
+
+    @field_validator("versions")
+    @classmethod
+    def _check_versions(cls, versions: dict[str, str]) -> dict[str, str]:
+        if missing := [name for name in ("python", "ba_torchrl") if not versions.get(name)]:
+            raise ValueError(f"without the version of {' and '.join(missing)}")
+        return versions
+
+    @field_validator("files")
+    @classmethod
+    def _check_files(cls, files: dict[str, str]) -> dict[str, str]:
+        for path in map(PurePosixPath, files.values()):
+            if path.is_absolute() or ".." in path.parts or "\0" in str(path):
+                raise ValueError(f"{path} is not a path inside the run folder")
+        return files
+
+    @field_validator("last", "best")
+    @classmethod
+    def _check_seeds(cls, test: TestedPolicy, info: ValidationInfo) -> TestedPolicy:
+        of_protocol = [*range(FIRST_TEST_SEED, FIRST_TEST_SEED + test.episodes)]
+        if info.data.get("protocol") == PROTOCOL and test.seeds != of_protocol:
+            raise ValueError(
+                f"the seeds are not those of protocol {PROTOCOL}, {FIRST_TEST_SEED} and following"
+            )
+        return test
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:
@@ -178,14 +218,32 @@ def write_result(folder: str | Path, result: RunResult) -> Path:
     return write_text(Path(folder) / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
 
 
-def read_result(folder: str | Path) -> RunResult:
-    """Read the result of a run folder."""
-    path = Path(folder) / RESULT_FILE
+def read_result(path: str | Path) -> RunResult:
+    """Read the result of a run, which somebody else may have written, from its folder or file.
+
+    Raises:
+        ConfigError: the file cannot be read, or is not the result of a run.
+    """
+    path = Path(path)
+    file = path / RESULT_FILE if path.is_dir() else path
     try:
-        return RunResult.model_validate_json(json_bytes(path))
+        return RunResult.model_validate_json(json_bytes(file))
+    except OSError as error:
+        raise ConfigError(f"cannot read {file}: {error.strerror}") from None
     except ValidationError as error:
-        reason = str(error).splitlines()[0]
-        raise ValueError(f"{path} is not the result of a run: {reason}") from None
+        problems = explain(error, RunResult, "result").problems
+        more = f" (and {len(problems) - 1} more)" if problems[1:] else ""
+        reason = " ".join(f"{problems[0][1]}{more}".split())
+        raise ConfigError(f"{file} is not the result of a run: {reason}") from None
+
+
+def file_of(folder: Path, result: RunResult, name: str) -> Path | None:
+    """Return a file of a run by its name in the result; None if the run has no such file, or one
+    that a link leads out of the run folder to."""
+    if name not in result.files:
+        return None
+    path, root = (folder / result.files[name]).resolve(), folder.resolve()
+    return path if path.is_relative_to(root) and path.is_file() else None
 
 
 def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:
@@ -216,7 +274,10 @@ def read_failure(folder: str | Path) -> str | None:
 def why_unfinished(folder: str | Path) -> str:
     """Return why a run folder holds no result that can be read."""
     if (Path(folder) / RESULT_FILE).exists():
-        return f"{RESULT_FILE} is damaged"
+        try:
+            read_result(folder)
+        except ConfigError as error:
+            return str(error).removeprefix(f"{folder}{os.sep}")
     return read_failure(folder) or "interrupted"
 
 

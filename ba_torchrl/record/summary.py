@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 import logging
 import math
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -388,8 +389,18 @@ def _obstacles(first: Group, second: Group) -> list[str]:
 
 
 def pipes(header: Sequence[str], *rows: Sequence[str]) -> list[str]:
-    """Return the lines of a table in Markdown."""
-    return [f"| {' | '.join(row)} |" for row in (header, ["---"] * len(header), *rows)]
+    """Return the lines of a table in Markdown; see `markdown` for its cells."""
+    rule = ["---"] * len(header)
+    return [f"| {' | '.join(map(markdown, row))} |" for row in (header, rule, *rows)]
+
+
+def markdown(text: str) -> str:
+    """Return a text as one line of Markdown that makes no HTML, no link and no cell of a table."""
+    return re.sub(r"[\\|<]|\](?=[(\[])", r"\\\g<0>", "".join(map(_printed, text)))
+
+
+def _printed(character: str) -> str:
+    return character if character.isprintable() or character == "\N{NO-BREAK SPACE}" else " "
 
 
 def _columns(name: str, found: Estimate) -> dict[str, float]:

@@ -25,6 +25,7 @@ _OPTIONS = {
     ".gif": ("-vf", "split[a][b];[a]palettegen=128[p];[b][p]paletteuse=dither=none", "-loop", "0"),
 }
 """Of ffmpeg, by suffix. Colours of yuv420p have half of the resolution, hence even sizes."""
+VIDEO_SUFFIXES = tuple(_OPTIONS)
 
 
 class FrameRecorder:

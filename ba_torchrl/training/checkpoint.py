@@ -169,9 +169,8 @@ def _read(folder: str | Path) -> dict[str, Any]:
 def parse_saved(saved: dict[str, Any], file: str | Path, **changes: Any) -> ExperimentConfig:
     """Return the configuration that a file holds with ``changes``; plugins that it names are not
     imported, and must be known (`check_known`)."""
-    plugins = saved.get("plugins")
-    if isinstance(plugins, list) and "plugins" not in changes:
-        check_known(map(str, plugins), file)
+    if "plugins" not in changes:
+        check_known(saved.get("plugins"), file)
     try:
         return ExperimentConfig.parse({**saved, **changes}, what=str(file))
     except ConfigError as error:

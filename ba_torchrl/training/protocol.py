@@ -16,11 +16,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.core.config import FIRST_TEST_SEED
+from ba_torchrl.core.config import PROTOCOL as PROTOCOL
 from ba_torchrl.demonstrations.episodes import Policy, is_success, play_seeds
 from ba_torchrl.record.results import TestedPolicy
 
-PROTOCOL = 1
-"""Rises when the numbers of the same policies change."""
 TEST_EPISODES = 500
 """Episodes of a number that is cited."""
 

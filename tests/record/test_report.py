@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from ba_torchrl.cli.command import Arguments
-from ba_torchrl.commands import report
+from ba_torchrl.commands import leaderboard, report
+from ba_torchrl.core.config import FIRST_TEST_SEED
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.report import write_report
@@ -21,6 +22,7 @@ from ba_torchrl.record.results import (
     differences,
     read_result,
     versions,
+    why_unfinished,
     write_result,
 )
 from ba_torchrl.record.summary import (
@@ -57,7 +59,8 @@ def policy_test(rate, seed=0, episodes=10):
     successes = round(rate * episodes)
     outcomes = [1] * successes + [0] * (episodes - successes)
     lengths = [6 + seed] * episodes
-    return TestedPolicy(updates=300, seeds=range(episodes), successes=outcomes, lengths=lengths)
+    seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
+    return TestedPolicy(updates=300, seeds=seeds, successes=outcomes, lengths=lengths)
 
 
 RESULT = {
@@ -74,7 +77,7 @@ RESULT = {
     "precision": "float32",
     "parameters": 1000,
     "phase_seconds": {"updates": 1800.0},
-    "versions": {"torch": "2.13.0", "ba_torchrl": "0.1.0", "commit": "abc"},
+    "versions": {"python": "3.11.0", "torch": "2.13.0", "ba_torchrl": "0.1.0", "commit": "abc"},
     "hardware": {"cpu": "Some CPU", "cores": 2, "memory_gb": 8.0, "gpu": None, "threads": 2},
     "finished": "2000-01-01T00:00:00+00:00",
     "files": {},
@@ -306,6 +309,92 @@ def test_a_result_is_read_as_it_was_written(tmp_path):
     assert [point.success_rate for point in result.curve] == [0.25, 0.5, 1.0]
     assert result.last.mean_length == 9.0
     assert [path.name for path in folder.iterdir()] == ["result.json"]
+
+
+OTHER_SEEDS = "the seeds are not those of protocol 1"
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "reason"),
+    [
+        (("last", "seeds"), [*range(10)], OTHER_SEEDS),
+        (("last", "seeds"), [FIRST_TEST_SEED] * 10, OTHER_SEEDS),
+        (("best", "seeds"), [-1, *range(9)], "greater than or equal to 0"),
+        (("last", "lengths"), [-6] * 10, "greater than or equal to 1"),
+        (("last", "lengths"), [6] * 9, "every episode has a seed, a success and a length"),
+        (("curve", 0, "success_rate"), 9.0, "less than or equal to 1"),
+        (("curve", 0, "success_rate"), -1.0, "greater than or equal to 0"),
+        (("curve", 0, "standard_error"), 9.0, "less than or equal to 1"),
+        (("curve", 1, "updates"), 100, "the updates of the points do not rise"),
+        (("curve", 0, "episodes"), 0, "greater than or equal to 1"),
+        (("env_steps",), 2**53, "less than 9007199254740992"),
+        (("seconds",), -1.0, "greater than or equal to 0"),
+        (("seed",), -1, "greater than or equal to 0"),
+        (("versions",), {}, "without the version of python and ba_torchrl"),
+        (("files", "video"), "/etc/hostname", "/etc/hostname is not a path inside the run folder"),
+        (("files", "video"), "a/../../other.mp4", "is not a path inside the run folder"),
+    ],
+)
+def test_a_result_that_no_run_can_have_is_left_out_with_the_reason(tmp_path, path, value, reason):
+    file = write_run(tmp_path / "run", (0.1, 0.6)) / "result.json"
+    values = part = json.loads(file.read_text())
+    for step in path[:-1]:
+        part = part[step]
+    part[path[-1]] = value
+    file.write_text(json.dumps(values))
+    with pytest.raises(ConfigError, match=re.escape(reason)) as error:
+        read_result(tmp_path / "run")
+    assert ".".join(map(str, path[:1])) in str(error.value)
+    runs, unfinished = load_runs([tmp_path])
+    assert (runs, unfinished) == ([], [tmp_path / "run"])
+    assert reason in why_unfinished(tmp_path / "run")
+
+
+def test_a_run_of_somebody_else_imports_and_copies_nothing_from_outside_its_folder(
+    tmp_path, monkeypatch, caplog
+):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("ba_torchrl.record.leaderboard.RECORDS", tmp_path / "none")
+    Path("evil.py").write_text("open('CODE_RAN', 'w')")
+    Path("secret.mp4").write_text("secret")
+    config = {"plugins": ["evil"]}
+    files = {"video": "film.mp4"}
+    write_run(Path("runs/a"), (0.1, 0.6), config=config, files=files, benchmark=None)
+    write_run(Path("runs/b"), (0.1, 0.6), config=config, files=files, benchmark=None, seed=1)
+    Path("runs/a/film.mp4").symlink_to("../../secret.mp4")
+    Path("runs/b/own.mp4").write_text("own")
+    Path("runs/b/film.mp4").symlink_to("own.mp4")
+    for module in (report, leaderboard):
+        caplog.clear()
+        module.COMMAND.run(["runs"])
+        (warning,) = caplog.messages
+        assert "uses the plugins [evil]" in warning
+        assert "If you trust them, add 'plugins=[evil]'" in warning
+    assert not Path("CODE_RAN").exists()
+    films = {path.name: path.read_text() for path in Path("runs/report").rglob("*.mp4")}
+    assert films == {"close_loop_block_reaching_sacfd_equi_seed1.mp4": "own"}
+
+
+def test_the_texts_of_a_run_are_texts_in_every_file(tmp_path):
+    label = "=1+1 <img src=x onerror=alert(1)> | [x](http://x)\n# $a_{$"
+    for number, task in enumerate(("mine/a_b", "mine_a/b", "mine_A/b")):
+        write_run(tmp_path / f"runs/{number}", (0.1, 0.6), label=label, task=task, final=0.0)
+        write_run(tmp_path / f"runs/-{number}", (0.1, 0.6), label="-0.81", task=task)
+    page = Page(write([tmp_path / "runs"], tmp_path / "report"))
+    folder = tmp_path / "report"
+    figures = [source for source in page.sources if source]
+    assert len({figure.casefold() for figure in figures}) == len(figures) == 3
+    assert all((folder / figure).is_file() for figure in figures)
+    assert label.split("\n")[0] in " ".join(texts(folder / figures[0])).replace("\n", " ")
+    text = (folder / "table.md").read_text()
+    assert "=1+1 \\<img src=x onerror=alert(1)> \\| [x\\](http://x) # $a_{$ |" in text
+    assert not re.search(r"(?<!\\)<img", text)
+    assert "<img src=x onerror" not in page.text
+    with (folder / "table.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    assert {row["method"] for row in rows} == {f"'{label}", "'-0.81"}
+    with (folder / "comparisons.csv").open(newline="") as file:
+        assert {row["difference"] for row in csv.DictReader(file)} == {"0.6"}
 
 
 def test_differences_ignore_fields_that_do_not_change_learning():

@@ -135,7 +135,7 @@ def test_the_last_policy_and_the_best_checkpoint_are_tested(tmp_path, monkeypatc
 
     def run_test(env, policy, updates, episodes, on_episode):
         note()
-        seeds = list(range(episodes))
+        seeds = [protocol.test_seed(episode) for episode in range(episodes)]
         return TestedPolicy(
             updates=updates, seeds=seeds, successes=[1] * episodes, lengths=[updates] * episodes
         )
