@@ -57,7 +57,8 @@ def main(config: ExperimentConfig) -> None:
         f"{result.seconds / 60:.1f} minutes"
     )
     print(f"  best        {best.success_rate:.2f}, the checkpoint of update {best.updates}")
-    print(f"  curve       {result.curve}")
+    if result.curve is not None:
+        print(f"  curve       {result.curve}")
     if result.video is not None:
         print(f"  video       {result.video}")
     print(f"  checkpoint  {result.checkpoint}")

@@ -5,9 +5,10 @@ from __future__ import annotations
 import logging
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
+from pathlib import Path
 
 import torch
 from tensordict import TensorDict
@@ -228,27 +229,41 @@ class Experiment:
         return all(point.success_rate >= target for point in last)
 
     def _finish(self) -> Result:
-        """Test the last policy and the best checkpoint; write curve, video and record."""
+        """Test the last policy and the best checkpoint; write the record, then curve and video."""
         config, state = self.config, self.state
         if not state.curve or state.curve[-1].updates < self.algorithm.updates:
             self._evaluate_and_save()
         latest, best_checkpoint = (self.checkpoints.find(which) for which in ("latest", "best"))
         self._can_save = False
         last = best = self._test()
-        with self._phase("video"):
-            video = record_video(config, self._greedy)
         if best_checkpoint != latest:
             self.checkpoints.load(best_checkpoint)
             best = self._test()
             self.checkpoints.load(latest)
+
+        def write(**pictures: Path | None) -> Path:
+            state.add_time("other")
+            files = {"checkpoint": latest, "best": best_checkpoint, **pictures}
+            return write_record(config, self.algorithm, last, best, state, files)
+
+        write()
+        self._resume_state.remove()
         rates = {"final/success_rate": last.success_rate, "final/mean_length": last.mean_length}
         self.log.write(last.updates, {**rates, "final/best_success_rate": best.success_rate})
-        curve = plot_curve(config, state.curve)
-        seconds = self.state.total_seconds()
-        files = {"curve": curve, "checkpoint": latest, "best": best_checkpoint, "video": video}
-        record = write_record(config, self.algorithm, last, best, state, files)
-        self._resume_state.remove()
-        return Result(last, best, latest, curve, video, record, seconds)
+        with self._phase("video"):
+            curve = self._picture("learning curve", lambda: plot_curve(config, state.curve))
+            video = self._picture("video", lambda: record_video(config, self._greedy))
+        record = write(curve=curve, video=video)
+        return Result(last, best, latest, curve, video, record, state.total_seconds())
+
+    def _picture(self, name: str, make: Callable[[], Path | None]) -> Path | None:
+        """Return the file of a figure or film; None, with a warning, if it cannot be made."""
+        try:
+            return make()
+        except Exception as error:  # of any library; the run is over and recorded
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            logger.warning("%s has no %s: %s", self.config.folder, name, reason)
+            return None
 
     # -- parts -------------------------------------------------------------------------------
 

@@ -38,8 +38,10 @@ class Result:
     """The checkpoint with the best evaluation."""
     checkpoint: Path
     """Of the last policy."""
-    curve: Path
+    curve: Path | None
+    """None if it could not be drawn."""
     video: Path | None
+    """None if the run wants none, or it could not be made."""
     record: Path
     """All of this and the whole curve as JSON; see `ba_torchrl.record.results`."""
     seconds: float

@@ -7,6 +7,7 @@ import signal
 import sys
 from typing import get_args
 
+import matplotlib
 import pytest
 import torch
 from tensordict import TensorDict
@@ -309,6 +310,27 @@ def test_a_run_whose_video_lacks_a_package_does_not_start(tmp_path, monkeypatch)
         Experiment(tiny(tmp_path, video_episodes=1))
     assert not list(tmp_path.iterdir())
     Experiment(tiny(tmp_path, video_episodes=0)).close()
+
+
+@pytest.mark.usefixtures("figures")
+def test_a_run_whose_figures_fail_is_finished(tmp_path, monkeypatch, caplog):
+    """Figures do not depend on the user's settings and labels; what fails is a warning."""
+
+    def film(*_):
+        written.append(read_result(tmp_path / "run").files.keys())
+        raise OSError("no space for a film")
+
+    written = []
+    monkeypatch.setattr("ba_torchrl.training.outputs.record_episodes", film)
+    changes = {**SHORT, "video_episodes": 1, "label": "$a_{$ costs"}
+    with matplotlib.rc_context({"text.usetex": True, "font.family": "none", "figure.dpi": -1}):
+        result = Experiment(tiny(tmp_path, **changes), progress=False).run()
+    assert written == [{"checkpoint", "best"}]  # the record is first
+    assert read_result(tmp_path / "run").files.keys() == {"checkpoint", "best", "curve"}
+    assert result.curve.read_bytes().startswith(b"\x89PNG")
+    assert result.video is None
+    assert "run has no video: OSError: no space for a film" in caplog.text
+    assert not (tmp_path / "run/resume").exists()
 
 
 OPEN_LOOP = {

@@ -62,7 +62,7 @@ def test_a_run_ends_while_it_learns_from_demonstrations_alone(tmp_path, seeds):
 def test_a_run_that_has_ended_takes_no_update_when_it_is_resumed(tmp_path, seeds, monkeypatch):
     first = Experiment(config_for(tmp_path), progress=False)
     with monkeypatch.context() as patch:
-        patch.setattr(experiments, "plot_curve", raise_interrupted)
+        patch.setattr(experiments, "write_record", raise_interrupted)
         with pytest.raises(Interrupted):
             first.run()
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
