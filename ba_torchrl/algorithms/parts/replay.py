@@ -62,9 +62,9 @@ class Prioritized(_Replay):
     importance_exponent: float = Field(default=0.4, ge=0, le=1)
     """Initial exponent beta of the importance weights, which increases to 1 over the run; with 0,
     the weights are 1 throughout."""
-    weighted_terms: WeightedTerms = "critic_and_policy"
+    weighted_terms: WeightedTerms = "none"
     """Terms of the loss that the importance weights multiply: "none", "critic",
-    "critic_and_policy", or "all", which adds those on demonstrations and the temperature. The
+    "critic_and_policy", or "all", which adds the terms of demonstrations and temperature. The
     appendix does not say; the reference implementation computes weights and does not use them."""
     weight_norm: WeightNorm = "max"
     """Statistic of a batch by which its importance weights are divided: "max", as in Schaul et al.

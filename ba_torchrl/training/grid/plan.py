@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import Field
 
 from ba_torchrl.core.config import StrictModel, parse
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
@@ -53,19 +53,21 @@ class BenchmarkConfig(StrictModel):
     "sacfd_per_so2"."""
     networks: list[str] = Field(min_length=1)
     """Names of preset files in ``configs/network``."""
-    datasets: list[str] = Field(default_factory=list)
-    """Folders of demonstrations in ``demonstrations_path/TASK``, a further axis; empty for none."""
+    variants: list[str] = Field(default_factory=lambda: [""], min_length=1)
+    """Names of settings in `per_variant`, a further axis; the empty name changes nothing."""
     seeds: Annotated[int, Field(ge=1, le=1000)] | list[int] = 4
     """A number of seeds, from 0 on, or a list of seeds."""
     skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
     """Runs to leave out: each entry gives a name or a list of names for ``task``, ``algorithm``,
-    ``network``, ``dataset`` or several of these; runs that match all of them are left out."""
+    ``network``, ``variant`` or several of these; runs that match all of them are left out."""
     per_task: Overrides = Field(default_factory=dict)
     """By task, fields that override those common to all runs."""
     per_algorithm: Overrides = Field(default_factory=dict)
     """By algorithm; overrides `per_task`."""
     per_network: Overrides = Field(default_factory=dict)
     """By network; overrides `per_algorithm`."""
+    per_variant: Overrides = Field(default_factory=dict)
+    """By variant; overrides `per_network`. "{task}" in ``demonstrations_path`` is the task's id."""
     launcher: dict[str, Any] = Field(default_factory=lambda: {"name": "local"})
     """``name`` of a registered launcher and its options: where the runs take place."""
     jobs: int = Field(default=1, ge=1)
@@ -82,7 +84,7 @@ class BenchmarkConfig(StrictModel):
         """Whether the grid leaves out a cell.
 
         Args:
-            cell: its ``task``, ``algorithm``, ``network`` and ``dataset``.
+            cell: its ``task``, ``algorithm``, ``network`` and ``variant``.
         """
         return any(
             all(
@@ -162,16 +164,17 @@ def expand(
         config.tasks,
         config.algorithms,
         config.networks,
-        config.datasets or [""],
+        config.variants,
     ):
-        task, algorithm, network, dataset = cell
-        if config.skips(task=task, algorithm=algorithm, network=network, dataset=dataset):
+        task, algorithm, network, variant = cell
+        if config.skips(task=task, algorithm=algorithm, network=network, variant=variant):
             continue
         given = _merged(
             common,
             config.per_task.get(task, {}),
             config.per_algorithm.get(algorithm, {}),
             config.per_network.get(network, {}),
+            config.per_variant.get(variant, {}),
         )
         chosen = {
             "algorithm": presets["algorithm", algorithm],
@@ -181,12 +184,9 @@ def expand(
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
-        if dataset:
-            if values.get("demonstrations_path") is None:
-                raise ConfigError("datasets: set demonstrations_path, the folder that they are in")
-            where = Path(values["demonstrations_path"], task, dataset)
-            values["demonstrations_path"] = str(where)
-        label = " ".join(filter(None, (algorithm, network, dataset)))
+        if isinstance(path := values.get("demonstrations_path"), str):
+            values["demonstrations_path"] = path.replace("{task}", task)
+        label = " ".join(filter(None, (algorithm, network, variant)))
         names = (name.replace("/", "_").replace(" ", "_") for name in (task, label))
         where = Path(config.folder, *names, f"seed{seed}")
         values |= {
@@ -251,11 +251,15 @@ def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
         "task": TASKS.__getitem__,
         "algorithm": lambda name: preset("algorithm", name),
         "network": lambda name: preset("network", name),
-        "dataset": lambda name: name,  # its folder is checked with the run
+        "variant": functools.partial(_known_variant, config),
     }
-    axes = {"task": config.tasks, "algorithm": config.algorithms, "network": config.networks}
-    datasets = ("dataset", config.datasets or [""])
-    for axis, names in (*axes.items(), datasets, ("seed", config.seed_list())):
+    axes = {
+        "task": config.tasks,
+        "algorithm": config.algorithms,
+        "network": config.networks,
+        "variant": config.variants,
+    }
+    for axis, names in (*axes.items(), ("seed", config.seed_list())):
         if len(set(names)) < len(names) or not names:
             raise ConfigError(f"{axis}s: {names} is empty or names one twice")
     for axis, names in (*axes.items(), *_mentioned(config)):
@@ -263,6 +267,11 @@ def _check_axes(config: BenchmarkConfig, preset: Preset) -> None:
             raise ConfigError(f"skip: unknown axis {axis!r}. Known: {', '.join(known)}")
         for name in names:
             known[axis](name)
+
+
+def _known_variant(config: BenchmarkConfig, name: str) -> None:
+    if name and name not in config.per_variant:
+        raise UnknownNameError("variant", name, config.per_variant, "per_variant has its settings.")
 
 
 def _mentioned(config: BenchmarkConfig) -> Iterator[tuple[str, Sequence[str]]]:

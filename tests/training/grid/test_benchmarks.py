@@ -34,6 +34,7 @@ def shipped(name, *overrides, make_runs=plan):
 
 
 GRIDS = {
+    "action_space": (1, 6),
     "architectures": (1, 5),
     "close_loop_3d": (10, 170),
     "close_loop_4d": (10, 170),
@@ -41,12 +42,15 @@ GRIDS = {
     "cpu_close_loop": (10, 35),
     "cpu_open_loop": (12, 12),
     "cpu_six_dof": (9, 9),
-    "demonstrations": (2, 8),
-    "equivariance": (3, 9),
+    "demonstrations": (1, 6),
+    "equivariance": (1, 4),
+    "equivariance_imitation": (2, 18),
     "imitation": (2, 12),
     "open_loop_2d": (12, 96),
     "open_loop_3d": (12, 96),
     "open_loop_6d": (9, 45),
+    "six_dof": (1, 2),
+    "units": (1, 4),
 }
 """Numbers of tasks and of runs with one seed, by benchmark; without that of graded sets."""
 NAMES = sorted({path.stem for path in (ROOT / "configs/benchmark").glob("*.yaml")} - {"offline"})
@@ -118,10 +122,10 @@ def test_offline_learning_reads_each_set_and_plays_no_episode(monkeypatch):
     methods = {"close_loop": {"bc cnn", "iql cnn"}, "open_loop": {"bc asr", "sdqfd asr"}}
     found = {(run.task, run.label) for run in runs}
     assert found == {
-        (task, f"{method} {dataset}")
+        (task, f"{method} {grade}")
         for task in config.tasks
         for method in methods[TASKS[task].control]
-        for dataset in ("random", "medium", "expert", "mixed")
+        for grade in ("random", "medium", "expert", "mixed")
     }
     assert len(found) == 64
     for run in runs:

@@ -111,19 +111,22 @@ def test_wrong_grids_are_refused(tmp_path, changes, message):
     assert not (tmp_path / "grid").exists()
 
 
-def test_datasets_are_an_axis_of_folders_below_the_task(tmp_path):
-    for grade in ("random", "expert"):
-        GradedSets(tmp_path / "sets" / REACH, REACH, 2, COMMON["env"], parallel=False).make(grade)
-    common = {"demonstrations_path": str(tmp_path / "sets")}
-    options = {"datasets": ["random", "expert"], "networks": ["cnn", "small"], "seeds": 1}
-    rule = {"network": "cnn", "dataset": "expert"}
-    runs = planned(tmp_path, common, skip=[rule], **options)
-    assert [run.label for run in runs] == ["sac cnn random", "sac small random", "sac small expert"]
-    assert runs[2].demonstrations_path == str(tmp_path / "sets" / REACH / "expert")
-    assert runs[2].run_dir.endswith("close_loop_block_reaching/sac_small_expert/seed0")
-    with pytest.raises(ConfigError, match=r"no demonstrations at .*block_reaching/medium"):
-        planned(tmp_path, common, **{**options, "datasets": ["medium"]})
-    with pytest.raises(ConfigError, match="datasets: set demonstrations_path"):
-        planned(tmp_path, **options)
-    with pytest.raises(ConfigError, match="names one twice"):
-        planned(tmp_path, common, datasets=["random", "random"])
+def test_variants_are_an_axis_of_settings(tmp_path):
+    sets = tmp_path / "sets"
+    GradedSets(sets / REACH, REACH, 2, COMMON["env"], parallel=False).make("random")
+    path = "demonstrations_path"
+    settings = {grade: {path: f"{sets}/{{task}}/{grade}"} for grade in ("random", "expert")}
+    options = {"variants": ["", "random"], "per_variant": settings, "seeds": 1}
+    rule = {"network": "cnn", "variant": "random"}
+    runs = planned(tmp_path, skip=[rule], networks=["cnn", "small"], **options)
+    assert [run.label for run in runs] == ["sac cnn", "sac small", "sac small random"]
+    assert runs[1].demonstrations_path is None
+    assert runs[2].demonstrations_path == str(sets / REACH / "random")
+    assert runs[2].run_dir.endswith("close_loop_block_reaching/sac_small_random/seed0")
+    for names, message in (
+        (["expert"], r"no demonstrations at .*block_reaching/expert"),
+        (["rando"], "unknown variant 'rando'. Did you mean 'random'"),
+        (["random", "random"], "names one twice"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            planned(tmp_path, **{**options, "variants": names})
