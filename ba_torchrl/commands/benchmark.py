@@ -10,11 +10,11 @@ ba-torchrl benchmark benchmark=close_loop_4d only=$SLURM_ARRAY_TASK_ID
 
 from __future__ import annotations
 
+import math
 import signal
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from datetime import timedelta
 from functools import partial
 from pathlib import Path
 from statistics import fmean
@@ -110,9 +110,10 @@ def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], at_once: i
     known = [fmean(each) for each in left if each]
     if known:
         at_once = min(at_once, len(known))
-        duration = timedelta(seconds=round(sum(known) / at_once))
+        hours, minutes = divmod(math.ceil(sum(known) / at_once / 60), 60)
+        duration = f"{hours} h {minutes} min" if hours else f"{minutes} min"
         runs = f"{len(known)} of {len(left)}"
-        print(f"about {duration} h for {runs} runs, {at_once} at a time, as finished ones took")
+        print(f"about {duration} for {runs} runs, {at_once} at a time, as finished ones took")
 
 
 COMMAND = Command(

@@ -42,6 +42,8 @@ _DATA_SUFFIXES = frozenset({".json", ".safetensors"})
 _TEXT_SUFFIXES = frozenset({".md", ".txt"})
 _TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"
 _CHUNK = 1 << 20
+_SCRATCH = re.compile(r"\.\d+\.[0-9a-f]{6}\.")
+"""Begin of the names that `replaced` yields."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 """Of file systems of networks that are mounted without locks."""
 _UNNAMED = "another process"
@@ -85,6 +87,13 @@ def replaced(path: str | Path) -> Iterator[Path]:
     finally:
         scratch.unlink(missing_ok=True)
     _flush(path.parent)
+
+
+def remove_scratch(folder: Path) -> None:
+    """Delete what a killed process left of files in a folder that no other process writes to."""
+    for path in folder.glob(".[0-9]*.*"):
+        if _SCRATCH.match(path.name):
+            path.unlink()
 
 
 def seal(folder: str | Path) -> None:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import errno
+import os
+import shutil
 import subprocess
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -86,21 +89,28 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
     if suffix == ".gif":
         fps = min(fps, 100)
     source = ("-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{width}x{height}", "-r", str(fps))
-    with replaced(path) as scratch:
+    folder = Path(os.path.realpath(path)).parent
+    folder.mkdir(parents=True, exist_ok=True)
+    # a file without a name, of which a killed process leaves nothing
+    with tempfile.TemporaryFile(dir=folder) as film:
         # not by the writer of imageio_ffmpeg, which does not report the exit code
         done = subprocess.run(
             [
                 *(imageio_ffmpeg.get_ffmpeg_exe(), "-y", "-v", "error", "-xerror"),
                 *(*source, "-i", "-"),
-                *(*_OPTIONS[suffix], str(scratch)),
+                *(*_OPTIONS[suffix], "-f", suffix[1:], f"/dev/fd/{film.fileno()}"),
             ],
             input=b"".join(picture.tobytes() for picture in pictures),
             capture_output=True,
             check=False,
+            pass_fds=[film.fileno()],
         )
         if done.returncode:
             lines = done.stderr.decode(errors="replace").splitlines() or ["no reason given"]
             raise OSError(errno.EIO, f"ffmpeg: {lines[0].split('] ')[-1]}")
+        film.seek(0)
+        with replaced(path) as scratch, scratch.open("wb") as file:
+            shutil.copyfileobj(film, file)
     return path
 
 

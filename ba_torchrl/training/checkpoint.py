@@ -43,6 +43,7 @@ from ba_torchrl.core.files import (
     lock_holder,
     read_json,
     read_state,
+    remove_scratch,
     seal,
     write_state,
     write_text,
@@ -80,6 +81,7 @@ def open_run_folder(config: ExperimentConfig) -> None:
     """Make the run folder and write the configuration into it. `ConfigError` if it holds another
     run, a finished one, or one that is not to be resumed."""
     folder = config.folder
+    remove_scratch(folder)
     if (folder / CONFIG_FILE).exists():
         if (folder / RESULT_FILE).exists():
             raise ConfigError(f"{folder} holds a finished run; choose another run_dir")

@@ -1,3 +1,5 @@
+import subprocess
+
 import numpy as np
 import pytest
 
@@ -24,6 +26,22 @@ def test_mp4_shows_the_frames(tmp_path, height, width, written):
     assert read.shape == (7, *written, 3)
     assert imageio.immeta(path, plugin="FFMPEG")["fps"] == 5
     assert np.abs(read[:, :height, :width].astype(int) - video).mean() < 6
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif"])
+def test_a_process_that_is_killed_leaves_no_file(tmp_path, monkeypatch, name):
+    encode = subprocess.run
+
+    def killed(*words, **options):
+        assert encode(*words, **options).returncode == 0
+        seen.append([*tmp_path.iterdir()])
+        raise KeyboardInterrupt
+
+    seen = []
+    monkeypatch.setattr(subprocess, "run", killed)
+    with pytest.raises(KeyboardInterrupt):
+        write_video(tmp_path / name, record_episodes(2, 64, 96), fps=5)
+    assert seen == [[]]
 
 
 def test_gif_shows_the_frames(tmp_path):

@@ -117,8 +117,11 @@ def test_a_run_interrupted_before_its_first_state_starts_again(tmp_path, caplog,
         patch.setattr(experiments, "evaluate", raise_interrupted)
         with pytest.raises(Interrupted):
             run(config_for(tmp_path))
+    (tmp_path / "run/.12.0a1b2c.config.json").touch()  # of a process that was killed
+    (tmp_path / "run/.12.notes").touch()
     result = run(config_for(tmp_path, resume=True))
     assert "has no saved state yet" in caplog.text
+    assert {path.name for path in (tmp_path / "run").glob(".*")} == {".12.notes"}
     assert result.updates == 9
     assert read_result(result.record.parent).resumed_at == []
 

@@ -203,6 +203,12 @@ def expand(
             raise ConfigError(f"{task} with {label}: {error}") from None
     if not runs:
         raise ConfigError("the grid is empty: `skip` leaves everything out")
+    owners: dict[Path, ExperimentConfig] = {}
+    for run in runs:
+        other = owners.setdefault(run.folder, run)
+        if other is not run:
+            names = " and ".join(f"{each.task} with {each.label}" for each in (other, run))
+            raise ConfigError(f"{names} have the same run folder {run.folder}: use two grids")
     return runs
 
 

@@ -3,7 +3,6 @@
 import functools
 import json
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from ba_torchrl.commands.benchmark import print_estimate
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import RunResult, read_result
 from ba_torchrl.tasks.base import TASKS
@@ -19,7 +19,7 @@ from ba_torchrl.training.checkpoint import lock_run
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
 from ba_torchrl.training.grid.launchers import local
-from ba_torchrl.training.grid.plan import status
+from ba_torchrl.training.grid.plan import Status, status
 from tests.recipes import recipe
 from tests.record.test_report import RESULT, policy_test, write
 from tests.training.grid.grids import COMMON, REACH, planned
@@ -322,7 +322,11 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
     assert "failed  " in out
     listed = printed("seeds=2", "dry_run=true")
     assert "2 runs: 1 done, 1 failed" in listed
-    assert re.search(r"about 0:00:\d\d h for 1 of 1 runs", listed)
+    assert "about 1 min for 1 of 1 runs" in listed
+    first, second = planned(tmp_path)
+    long = [(first, Status("done", seconds=4950.0)), (second, Status("missing"))]
+    print_estimate(long, 1)
+    assert "about 1 h 23 min for 1 of 1 runs" in capsys.readouterr().out
     more = ("seeds=3", "dry_run=true", "jobs=2")
     assert "for 2 of 2 runs, 2 at a time" in printed(*more)
     assert "for 2 of 2 runs, 1 at a time" in printed(*more, "launcher=ray")  # jobs has no effect

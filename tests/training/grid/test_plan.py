@@ -103,6 +103,10 @@ def test_skip_leaves_out_matching_runs(tmp_path):
         ({"common": {"env": {"robot": "sawyer"}}}, "kuka"),
         ({"tasks": [PLACE]}, "algorithm 'sac' learns close_loop tasks"),
         ({"per_task": {REACH: {"env": {"obs_sise": 64}}}}, "Did you mean 'obs_size'"),
+        (
+            {"variants": ["a b", "a_b"], "per_variant": {"a b": {}, "a_b": {}}},
+            "sac small a b and .*sac small a_b have the same run folder",
+        ),
     ],
 )
 def test_wrong_grids_are_refused(tmp_path, changes, message):
