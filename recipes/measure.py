@@ -16,6 +16,7 @@ from typing import Annotated  # noqa: E402
 
 from ba_torchrl.cli.command import Command  # noqa: E402
 from ba_torchrl.cli.types import Count, PluginSettings, Text, check_writable_file, checked  # noqa: E402
+from ba_torchrl.core.config import LocalPath  # noqa: E402
 from ba_torchrl.training.config import usable_device  # noqa: E402
 from profiling.comparison import columns_of_changes  # noqa: E402
 from profiling.speed_file import (  # noqa: E402
@@ -26,7 +27,7 @@ from profiling.speed_file import (  # noqa: E402
 )
 from profiling.table import COLUMNS, CompileMode, Precision, as_markdown, measure  # noqa: E402
 
-JsonFile = Annotated[Text, checked(partial(check_writable_file, suffixes=(".json",)))]
+JsonFile = Annotated[LocalPath, checked(partial(check_writable_file, suffixes=(".json",)))]
 
 
 class Settings(PluginSettings):
@@ -44,7 +45,7 @@ class Settings(PluginSettings):
     """`torch.compile` of the learners' losses."""
     output: JsonFile | None = None
     """Write all values, machine, versions and commit to this file."""
-    compare: Text | None = None
+    compare: LocalPath | None = None
     """Print ratios to the rows of this file."""
     profile: bool = False
     """Print a profile of each timed call."""

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Sequence
@@ -24,7 +26,7 @@ from pydantic import BaseModel
 from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import name_presets, plain_errors
 from ba_torchrl.cli.help import describe
-from ba_torchrl.core.config import parse
+from ba_torchrl.core.config import expanded, parse, takes_path
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import has_entry_points, load_plugins
 from ba_torchrl.record.logging import limit_library_logs
@@ -157,13 +159,42 @@ class Command:
             self._refuse(options[0], words)
         if self.config is None and (found.config_name or found.config_dir):
             raise ConfigError(f"{self.name} has no configuration files; set its fields")
-        if found.config_dir is not None and not Path(found.config_dir).is_dir():
-            raise ConfigError(f"there is no folder {found.config_dir}")
-        bare = [word for word in rest if "=" not in word and not word.startswith("~")]
-        overrides = [_readable(word) for word in rest if word not in bare]
+        folder = None if found.config_dir is None else expanded(found.config_dir)
+        if folder is not None and not Path(folder).is_dir():
+            raise ConfigError(f"there is no folder {folder}")
+        bare = [word for word in rest if self._is_bare(word)]
+        overrides = [self._readable(word) for word in rest if word not in bare]
         if bare:
             overrides += self._positional(bare, overrides)
-        return Arguments(overrides, found.config_name, found.config_dir, found.help)
+        return Arguments(overrides, found.config_name, folder, found.help)
+
+    def _is_bare(self, word: str) -> bool:
+        """Whether a word is the value of a positional field, such as a path with "=" or "~"."""
+        if self.config is not None:  # Hydra has groups, "a/b=c", and deletions, "~a"
+            return "=" not in word and not word.startswith("~")
+        name = word.split("=")[0].lstrip("+")
+        is_setting = name.split(".")[0] in self.settings.model_fields
+        return "=" not in word or "/" in name or (not is_setting and os.path.lexists(word))
+
+    def _readable(self, override: str) -> str:
+        """Return an override with quotes around a text that Hydra cannot read, or would read as
+        something else than a path."""
+        name, is_set, value = override.partition("=")
+        if not is_set or value.startswith(("'", '"', "{", "${")) or value in ("", "null"):
+            return override
+        is_path = name in self._paths
+        is_list = value.startswith("[") and value.endswith("]")
+        if is_list and is_path and not _is_read(override):
+            return f"{name}=[{','.join(_quoted(item.strip()) for item in value[1:-1].split(','))}]"
+        is_text = not value.startswith("[") and (is_path or not _is_read(override))
+        return f"{name}={_quoted(value)}" if is_text else override
+
+    @property
+    def _paths(self) -> set[str]:
+        """The settings that are paths."""
+        further = {} if self.config is None else ExperimentConfig.model_fields
+        fields = {**further, **self.settings.model_fields}
+        return {name for name, field in fields.items() if takes_path(field)}
 
     def _refuse(self, option: str, words: Sequence[str]) -> NoReturn:
         """Refuse an option; if it is the name of a setting, say how to write it."""
@@ -206,7 +237,7 @@ class Command:
             other = Path(arguments.config_dir).resolve()
             if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
                 main_folder, other = other, main_folder
-            overrides.append(f"hydra.searchpath=['file://{other}']")
+            overrides.append(f"hydra.searchpath=[{_quoted(f'file://{other}')}]")
         with initialize_config_dir(str(main_folder), version_base="1.3", job_name=self.name):
             try:
                 settings = compose(name, overrides=overrides, return_hydra_config=True)
@@ -246,14 +277,17 @@ class Command:
 
 
 def _quoted(word: str) -> str:
-    return "'" + word.replace("'", "\\'") + "'"
+    """Return a text in quotes; backslashes before a quote are doubled, as Hydra reads them."""
+    return "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", "\\'"), word) + "'"
 
 
-def _readable(override: str) -> str:
-    """Return an override with quotes around a text with letters that Hydra cannot read."""
-    name, _, value = override.partition("=")
-    is_read = value.isascii() or value[0] in "'\"[{"
-    return override if is_read else f"{name}={_quoted(value)}"
+def _is_read(override: str) -> bool:
+    """Whether Hydra can read an override."""
+    try:
+        OverridesParser.create().parse_override(override)
+    except HydraException:
+        return False
+    return True
 
 
 def _explained(error: HydraException) -> ConfigError:
@@ -261,7 +295,9 @@ def _explained(error: HydraException) -> ConfigError:
     cause = error.__cause__
     first = (str(error) or repr(cause)).splitlines()[0]
     if isinstance(error, OverrideParseException):
-        return ConfigError(f"cannot read {error.override!r}: {first}")
+        in_braces = re.search("{.*[~=]", error.override)
+        hint = "; texts in braces with ~ or = need quotes" if in_braces else ""
+        return ConfigError(f"cannot read {error.override!r}: {first}{hint}")
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, name = error.missing_cfg_file.rpartition("/")
         known = [option for option in error.options or () if option != "schema"]

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, StrictModel
+from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, LocalPath, StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
@@ -89,16 +89,16 @@ TaskId = Annotated[str, checked(TASKS.__getitem__)]
 Tasks = Annotated[list[TaskId], Field(min_length=1), as_list] | None
 """Ids of tasks, or one; None for all."""
 Folders = Annotated[
-    list[Annotated[Text, checked(_folder_exists)]],
+    list[Annotated[LocalPath, checked(_folder_exists)]],
     Field(min_length=1),
     as_list,
 ]
 """Existing folders, or one."""
-OutputFolder = Annotated[Text, checked(check_writable_folder)]
-NewPath = Annotated[Text, checked(check_new), checked(check_writable_file)]
-PngFile = Annotated[Text, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
+OutputFolder = Annotated[LocalPath, checked(check_writable_folder)]
+NewPath = Annotated[LocalPath, checked(check_new), checked(check_writable_file)]
+PngFile = Annotated[LocalPath, checked(functools.partial(check_writable_file, suffixes=(".png",)))]
 VideoFile = Annotated[
-    Text, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
+    LocalPath, checked(functools.partial(check_writable_file, suffixes=(".mp4", ".gif")))
 ]
 
 

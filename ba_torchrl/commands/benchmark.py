@@ -11,6 +11,7 @@ ba-torchrl benchmark benchmark=close_loop_4d only=$SLURM_ARRAY_TASK_ID
 from __future__ import annotations
 
 import math
+import shlex
 import signal
 import sys
 from collections import Counter, defaultdict
@@ -98,7 +99,7 @@ def main(task: Task) -> None:
     if failures:
         sys.exit(1)
     if only is None:
-        print(f"  next    ba-torchrl report {config.folder}")
+        print(f"  next    {shlex.join(['ba-torchrl', 'report', config.folder])}")
 
 
 def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], at_once: int) -> None:

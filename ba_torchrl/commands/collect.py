@@ -17,12 +17,11 @@ from ba_torchrl.cli.types import (
     Count,
     EnvSettings,
     TaskId,
-    Text,
     VectorSettings,
     check_new,
     check_writable_file,
 )
-from ba_torchrl.core.config import Source
+from ba_torchrl.core.config import LocalPath, Source
 from ba_torchrl.core.files import complete_only
 from ba_torchrl.envs.settings import check_env
 from ba_torchrl.record.logging import progress_bar
@@ -35,7 +34,7 @@ class Settings(VectorSettings, EnvSettings):
     set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set source"}
     task: TaskId = "close_loop/block_picking"
     """Id of the task."""
-    path: Text | None = None
+    path: LocalPath | None = None
     """New folder of the demonstrations; null for that of the task in demos."""
     source: Source = "expert"
     """The expert's episodes, or structures that are taken apart, reversed in time."""

@@ -13,13 +13,14 @@ from typing import Annotated
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import NewPath, PluginSettings, Text, checked
+from ba_torchrl.core.config import LocalPath
 from ba_torchrl.demonstrations.formats.base import FORMATS, card_file
 
 
 class Settings(PluginSettings):
     """Settings of this command."""
 
-    demos: Text
+    demos: LocalPath
     """A folder that collect wrote."""
     format: Annotated[Text, checked(FORMATS.__getitem__)]
     """Of the library."""

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, Seed, Text, VectorSettings, VideoFile
-from ba_torchrl.core.config import FIRST_TEST_SEED, Which
+from ba_torchrl.core.config import FIRST_TEST_SEED, LocalPath, Which
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import CITABLE_EPISODES, TestedPolicy
 from ba_torchrl.record.statistics import wilson
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 class EpisodeSettings(VectorSettings):
     """A policy and the episodes that it plays."""
 
-    policy: Text
+    policy: LocalPath
     """A run folder, one of the checkpoints in it, a .safetensors file, or a task whose policy the
     package ships."""
     which: Which = "best"

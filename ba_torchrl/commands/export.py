@@ -14,12 +14,13 @@ from pydantic import Field
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import NewPath, Text, check_new, check_writable_file
 from ba_torchrl.commands import evaluate
+from ba_torchrl.core.config import LocalPath
 
 
 class Settings(evaluate.EpisodeSettings):
     """Settings of this command: those of the evaluation that the card reports, and the file."""
 
-    policy: Text
+    policy: LocalPath
     """A run folder, one of the checkpoints in it, or a .safetensors file."""
     path: NewPath | None = None
     """New file; null for one named after the task."""

@@ -12,7 +12,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, EnvSettings, Fps, TaskId, Text, VideoFile
+from ba_torchrl.cli.types import Count, EnvSettings, Fps, TaskId, VideoFile
+from ba_torchrl.core.config import LocalPath
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.record.video import write_video
@@ -27,7 +28,7 @@ class Settings(EnvSettings):
     set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set policy"}
     task: TaskId | None = None
     """Id of the task; a policy of a run knows its own."""
-    policy: Text = "expert"
+    policy: LocalPath = "expert"
     """expert, random, trained (the policy that the package ships), or a run folder, a checkpoint or
     a .safetensors file."""
     episodes: Count = 1

@@ -16,6 +16,7 @@ from typing import Any
 
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
+from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import CITABLE_EPISODES, CONFIG_FILE, NON_LEARNING_FIELDS
 from ba_torchrl.training.config import ExperimentConfig
@@ -28,7 +29,8 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
     from ba_torchrl.training.checkpoint import read_config
 
     if values["resume"] is True:
-        folder, exists = values["run_dir"], (Path(values["run_dir"]) / CONFIG_FILE).exists()
+        folder = expanded(values["run_dir"])
+        exists = (Path(folder) / CONFIG_FILE).exists()
         if arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
             if not exists:
                 raise ConfigError(f"there is no run in {folder} to resume")
@@ -64,7 +66,7 @@ def main(config: ExperimentConfig) -> None:
     print(f"  checkpoint  {result.checkpoint}")
     print(f"  result      {result.record}")
     print("  to use it in Python:")
-    print(f'    policy = ba_torchrl.load_policy("{config.run_dir}", which="latest")  # or "best"')
+    print(f'    policy = ba_torchrl.load_policy({config.run_dir!r}, which="latest")  # or "best"')
     print("    env = policy.make_env()")
     print("    env.rollout(env.max_steps, policy)")
 

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Collection, Iterable, Mapping
-from typing import Any, Literal, TypeVar, get_args
+from pathlib import Path
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
+    AfterValidator,
     BaseModel,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
     ValidationError,
 )
+from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema
 
-from ba_torchrl.core.errors import SettingsError, UnknownNameError
+from ba_torchrl.core.errors import ConfigError, SettingsError, UnknownNameError
 
 Interval = tuple[float, float]
 
@@ -26,6 +30,40 @@ CompileMode = Literal["default", "reduce-overhead", "max-autotune"]
 """Mode of `torch.compile`; all but the first replay CUDA graphs on a GPU."""
 Which = Literal["best", "latest"]
 """Of a run's checkpoints, the one with the highest success rate in evaluation, or the last."""
+
+
+def expanded(path: str | Path) -> str:
+    """Return a path in which the home folder replaces a leading ``~`` or ``~user``.
+
+    Shells replace it at the start of a word alone, and files of configuration are read by none.
+
+    Raises:
+        ConfigError: there is no such home folder, or the path has a null character.
+    """
+    path = str(path)
+    if "\0" in path:
+        raise ConfigError(f"{path!r} is no path: it has a null character")
+    found = os.path.expanduser(path)
+    if found.startswith("~"):
+        name = path.partition(os.sep)[0]
+        raise ConfigError(
+            f"{path}: {name} has no home folder on this machine; write the whole path, from /"
+        )
+    return found
+
+
+_EXPANDED = AfterValidator(expanded)
+LocalPath = Annotated[str, Field(min_length=1), _EXPANDED]
+"""The type of every setting that is the path of a file or folder."""
+
+
+def takes_path(field: FieldInfo) -> bool:
+    """Whether a field is a path, or has paths."""
+
+    def mentions(annotation: Any) -> bool:
+        return annotation is _EXPANDED or any(map(mentions, get_args(annotation)))
+
+    return _EXPANDED in field.metadata or mentions(field.annotation)
 
 
 def explain(

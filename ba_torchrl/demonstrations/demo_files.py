@@ -14,6 +14,7 @@ import torchrl
 from tensordict import NonTensorStack, TensorDict
 
 from ba_torchrl import __version__
+from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import (
     check,
@@ -74,7 +75,7 @@ def save_demonstrations(
     """
     if not episodes:
         raise ValueError("there are no episodes to save")
-    path = Path(path)
+    path = Path(expanded(path))
     if path.exists() and any(path.iterdir()):
         raise FileExistsError(f"{path} is not empty; choose another folder")
     check_entries(episodes, task, env)
@@ -130,7 +131,7 @@ def load_demonstrations(
             differ; the message names every difference. Without a task, another version of it is a
             warning.
     """
-    path = Path(path)
+    path = Path(expanded(path))
     if not _is_own(path, mapping):
         if task is None:
             raise ConfigError(f"{path} is of another library: name the task and its env")
@@ -145,7 +146,7 @@ def load_demonstrations(
 
 def read_demonstrations(path: str | Path) -> tuple[list[TensorDict], dict[str, Any]]:
     """Return the episodes of a folder that `save_demonstrations` wrote, and its metadata."""
-    path = Path(path)
+    path = Path(expanded(path))
     if os.path.exists(path) and not os.path.exists(path / METADATA_FILE):
         raise ConfigError(
             f"no demonstrations of ours at {path}: a folder that `ba-torchrl collect` or "

@@ -16,6 +16,7 @@ from tensordict import NonTensorStack, TensorDict, TensorDictBase
 
 from ba_torchrl import __version__
 from ba_torchrl.core import keys
+from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.demonstrations.episodes import mean_return, success_rate
 from ba_torchrl.demonstrations.formats.base import (
@@ -80,7 +81,7 @@ def export_demonstrations(
             format's suffix, or an episode lacks an entry or has another shape.
         ValueError: there are no episodes.
     """
-    form, path = FORMATS[format], Path(path)
+    form, path = FORMATS[format], Path(expanded(path))
     if not episodes:
         raise ValueError("there are no episodes to export")
     if form.suffixes and path.suffix.lower() not in form.suffixes:

@@ -17,6 +17,7 @@ from pydantic import Field
 from ba_torchrl.core.config import (
     MAX_SEED,
     CompileMode,
+    LocalPath,
     Source,
     WorkerOptions,
     parse,
@@ -95,11 +96,11 @@ class ExperimentConfig(WorkerOptions):
     """Probability of a random turn beside the expert's other components, likewise. An expert turns
     the gripper at the beginning of a motion, so that its later steps have no wrong yaw, in which a
     policy that has not learnt to turn arrives. None in the appendix."""
-    demonstrations_path: str | None = None
+    demonstrations_path: LocalPath | None = None
     """Folder that `ba-torchrl collect` wrote, or demonstrations in the format of LeRobot, Minari,
     robomimic or Diffusion Policy. They replace newly collected ones, and source and noise are
     theirs."""
-    demonstrations_mapping: str | None = None
+    demonstrations_mapping: LocalPath | None = None
     """YAML file with the names of the entries in somebody else's demonstrations (docs/data.md)."""
     pretrain_updates: int = Field(default=0, ge=0)
     """Updates on the demonstrations before the first environment step, besides the first ones of
@@ -132,7 +133,7 @@ class ExperimentConfig(WorkerOptions):
     """Greedy episodes in the video at the end."""
     label: str = "run"
     """Name of the curve in plots, such as "sacfd equi"."""
-    run_dir: str = Field(default="runs/run", min_length=1)
+    run_dir: LocalPath = "runs/run"
     """Folder of the run's files."""
     resume: bool = False
     """Continue the run in that folder if it was interrupted."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import shlex
 import signal
 import threading
 from pathlib import Path
@@ -62,10 +63,8 @@ class StopSignals:
         """Return the exception that ends the process."""
         name = signal.Signals(self._received).name
         what = "state saved" if is_saved else "nothing to save yet"
-        return RunStopped(
-            f"stopped by {name}, {what}: ba-torchrl train run_dir={folder} resume=true continues",
-            self._received,
-        )
+        command = shlex.join(["ba-torchrl", "train", f"run_dir={folder}", "resume=true"])
+        return RunStopped(f"stopped by {name}, {what}: {command} continues", self._received)
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         if self._received is None:

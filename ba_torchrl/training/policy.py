@@ -27,7 +27,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import StrictModel, explain
+from ba_torchrl.core.config import StrictModel, expanded, explain
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError, UnknownNameError, check_choice
 from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.core.hardware import hardware
@@ -288,7 +288,7 @@ def load_policy(
             known = ", ".join(shipped_policies()) or "none"
             raise ConfigError(f"no trained policy of {source} is shipped; those that are: {known}")
     else:
-        path = Path(source)
+        path = Path(expanded(source))
         if not path.exists():
             hint = f"; and there is no run folder and no file of a policy {source}"
             raise UnknownNameError("policy", str(source), shipped_policies(), hint)

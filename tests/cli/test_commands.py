@@ -4,8 +4,12 @@ import errno
 import importlib
 import json
 import os
+import pkgutil
+import re
 import shutil
 from collections import namedtuple
+from pathlib import Path
+from typing import get_args, get_origin
 
 import pytest
 import torch
@@ -15,7 +19,7 @@ import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE, types
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.cli.types import check_writable_file
-from ba_torchrl.core.config import StrictModel, parse
+from ba_torchrl.core.config import StrictModel, parse, takes_path
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import complete_only
 from tests.recipes import load_recipe, recipe
@@ -113,8 +117,8 @@ def test_play_says_whether_each_episode_succeeded(capsys):
     [
         ("Plugins", ["json"], ["json", [""], ["no_such_module"], 3]),
         ("Tasks", None, [3, [], ["close_loop/none"], [1]]),
-        ("Folders", "run", ["nope", [], ["nope"], 5, None, [1], LONG]),
-        ("OutputFolder", "new", ["file", "file/x", "/proc/nope/x", "/dev/full/x", LONG]),
+        ("Folders", "run", ["nope", [], ["nope"], 5, None, [1], LONG, ["~no one/run"]]),
+        ("OutputFolder", "new", ["file", "file/x", "/proc/nope/x", "/dev/full/x", LONG, "a\0b"]),
         ("NewPath", "new.md", ["run", "file", "link", "file/x", "/dev/full/x", LONG]),
         ("PngFile", "new.png", ["new.nope", "file/x.png", "folder.png"]),
         ("VideoFile", "new.GIF", ["new.avi", "/dev/full/x.mp4"]),
@@ -131,6 +135,50 @@ def test_types_of_settings(kind, right, wrong, monkeypatch, tmp_path):
     for value in wrong:
         with pytest.raises(ConfigError, match=r"^invalid settings:\n  value"):
             parse(model, {"value": value}, "settings")
+
+
+NO_PATHS = {
+    *("Source.source", "PolicyCard.policy_file", "RunResult.policy_file", "PolicyCard.evaluate"),
+    *("BenchmarkConfig.algorithms", "BenchmarkConfig.networks"),
+}
+"""Fields whose descriptions speak of files: names in them, names of presets, checksums."""
+
+
+def models(base):
+    for model in base.__subclasses__():
+        yield model
+        yield from models(model)
+
+
+def _owner(model, field):
+    """The class that declares a field."""
+    return [each for each in model.__mro__ if field in vars(each).get("__annotations__", ())][-1]
+
+
+def has_text(annotation):
+    """Whether a value can be a text, a path, or a list of them."""
+    is_mapping = get_origin(annotation) is dict
+    parts = () if is_mapping else get_args(annotation)
+    return annotation in (str, Path) or any(map(has_text, parts))
+
+
+def test_every_path_among_the_settings_has_the_type_of_paths():
+    for module in pkgutil.walk_packages(ba_torchrl.__path__, "ba_torchrl."):
+        if not module.name.endswith("__main__"):
+            importlib.import_module(module.name)
+    recipes = [load_recipe(name).Settings for name in ("gallery", "measure", "plot", "soak")]
+    ours = [model for model in models(StrictModel) if model.__module__.startswith("ba_torchrl.")]
+    found, others = set(), set()
+    for model in {*ours, *recipes}:
+        for name, field in model.model_fields.items():
+            words = f"{name} {field.description}".lower()
+            speaks = re.search(r"\b(file|folder|path)s?\b|path|_dir|root|folder|mapping", words)
+            if takes_path(field):
+                found.add(name)
+            elif has_text(field.annotation) and (speaks or field.annotation is Path):
+                others.add(f"{_owner(model, name).__name__}.{name}")
+    assert others == NO_PATHS
+    assert {"run_dir", "demonstrations_path", "asset_root", "runs", "policy", "video"} <= found
 
 
 def test_too_many_environments_are_refused():

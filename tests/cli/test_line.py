@@ -1,15 +1,18 @@
 """The command line: names, mistakes, help, and what it is given to resume."""
 
+import json
 import signal
 import subprocess
 import sys
 
 import pytest
+from omegaconf import OmegaConf
 
 from ba_torchrl import cli
 from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import train
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.config import ExperimentConfig
 from tests.fresh import run_script
@@ -109,6 +112,43 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
 )
 def test_a_mistake_is_one_line_with_the_nearest_name(words, message, capsys):
     assert message in refused(words, capsys)
+
+
+ODD = "a=b, c;é#(~)'"
+
+
+@pytest.mark.parametrize(
+    ("name", "words", "field", "found"),
+    [
+        ("report", [f"~/{ODD}"], "runs", [f"HOME/{ODD}"]),
+        ("report", ["a=b"], "runs", ["a=b"]),
+        ("leaderboard", ["runs=[~/a=b,a=b]"], "runs", ["HOME/a=b", "a=b"]),
+        ("evaluate", [f"policy=~/{ODD}"], "policy", f"HOME/{ODD}"),
+        ("convert", ["x/y=z", "format=zarr", "path=~/new=z"], "demos", "x/y=z"),
+        ("convert", ["x/y=z", "format=zarr", "path=~/new=z"], "path", "HOME/new=z"),
+        ("train", ["--config-name", "quickstart", f"run_dir=~/{ODD}"], "run_dir", f"HOME/{ODD}"),
+        ("train", ["--config-dir=~/a=b", "run_dir=2024"], "run_dir", "2024"),
+        ("train", ["label=~ a(b)=c"], "label", "~ a(b)=c"),  # no path
+        ("benchmark", [f"folder=~/{ODD}"], "folder", f"HOME/{ODD}"),
+    ],
+)
+def test_paths_may_have_any_sign_and_begin_in_the_home(
+    name, words, field, found, tmp_path, monkeypatch
+):
+    """As shells pass them that leave ``~`` after "="."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    for folder in (ODD, "a=b"):
+        (tmp_path / folder).mkdir()
+    command = load_recipe(name).COMMAND
+    hydra_schema.register_open(cli.config_dir())
+    arguments = command.read(words)
+    with command.composed(arguments) as settings:
+        values = OmegaConf.to_container(settings)
+    model = ExperimentConfig if name == "train" else command.settings
+    own = {key: value for key, value in values.items() if key in model.model_fields}
+    value = getattr(model.model_validate(own), field)
+    assert json.loads(json.dumps(value).replace(str(tmp_path), "HOME")) == found
 
 
 @pytest.mark.parametrize("name", [name for name in cli.command_names() if name != "doctor"])

@@ -63,9 +63,10 @@ def test_demonstrations_of_both_sources_can_be_loaded(collected, tmp_path):
     assert set(metadata["versions"]) == {"ba_torchrl", "torch", "torchrl"}
 
 
-def test_explicit_default_values_are_accepted(collected, tmp_path):
+def test_explicit_default_values_are_accepted(collected, tmp_path, monkeypatch):
     _, episodes = collected
-    save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    save_demonstrations("~/demos", episodes, task=TASK, env=ENV, seed=0)
     spelled = {"action_sequence": "pxyr", "half_rotation": True, "max_steps": 10, "robot": "kuka"}
     loaded = load_demonstrations(tmp_path / "demos", task=TASK, env={**ENV, **spelled})
     assert len(loaded) == len(episodes)

@@ -314,10 +314,11 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     out = capsys.readouterr().out
     success = float(out.split("success_rate ")[1].split()[0])
     assert f"  card      {success:.2f} (" in out  # the same episodes
-    recipe("export", str(run), "path=my files/p.safetensors", *options)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    recipe("export", str(run), "path=~/my files/p=1.safetensors", *options)
     out = capsys.readouterr().out
     check = shlex.split(out.split("  check   ")[1])
-    assert check[2] == "policy=my files/p.safetensors"
+    assert check[2] == f"policy={tmp_path}/my files/p=1.safetensors"
     recipe(*check[1:])
     assert f"success_rate {success:.2f} (" in capsys.readouterr().out
     recipe("play", f"policy={file}", "video=film.gif")

@@ -38,7 +38,7 @@ def cache_folder() -> Path:
     """
     root = os.environ.get(CACHE_VARIABLE)
     try:
-        return (Path(root) if root else user_cache_path("ba_torchrl")) / "parts"
+        return (Path(root).expanduser() if root else user_cache_path("ba_torchrl")) / "parts"
     except RuntimeError as error:
         raise FileNotFoundError(str(error)) from error
 

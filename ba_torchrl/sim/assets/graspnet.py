@@ -6,13 +6,13 @@ import contextlib
 import io
 import logging
 import math
-import os
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
+from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.sim.assets.base import OBJECT_SETS, ObjectSet
 from ba_torchrl.sim.assets.cache import Decomposition, cached_parts
@@ -76,7 +76,7 @@ class GraspNet(ObjectSet):
             raise ConfigError(
                 f"object_set='graspnet' needs asset_root, a folder: {EXPECTED_LAYOUT}"
             )
-        root = Path(os.path.expanduser(asset_root))
+        root = Path(expanded(asset_root))
         with _as_config_error(root):
             if not root.is_dir():
                 raise ConfigError(

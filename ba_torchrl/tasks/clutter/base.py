@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from pydantic import Field
 
-from ba_torchrl.core.config import TaskParameters
+from ba_torchrl.core.config import LocalPath, TaskParameters
 from ba_torchrl.sim.assets.base import load_object_set
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose, downward
@@ -51,7 +51,7 @@ class ClutterTask(Task):
 
         object_set: str = "random"
         """Name of the object set; see `ba_torchrl.sim.assets`."""
-        asset_root: str | None = None
+        asset_root: LocalPath | None = None
         """Folder of an object set that is not part of the package."""
         max_attempts: int | None = Field(default=None, ge=1)
         """Episodes with the same heap after which new objects are dropped; None for the reference

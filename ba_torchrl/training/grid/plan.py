@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from ba_torchrl.core.config import StrictModel, parse
+from ba_torchrl.core.config import LocalPath, StrictModel, parse
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
@@ -43,7 +43,7 @@ class BenchmarkConfig(StrictModel):
 
     name: str
     """Of the benchmark, for reports."""
-    folder: str = Field(min_length=1)
+    folder: LocalPath
     """Of all its runs."""
     tasks: list[str] = Field(min_length=1)
     """Ids of tasks."""
