@@ -68,7 +68,7 @@ def command_lines(pages: list[Path] = PAGES) -> list[str]:
             "".join([*blocks(page, ""), *blocks(page, "bash")]).replace("\\\n", " ").splitlines()
         )
         lines += re.findall(r"`(ba-torchrl [^`\n]+)`", page.read_text())
-        found |= {line.split("  #")[0].strip() for line in lines}
+        found |= {line.split("  #")[0].strip().removeprefix("exec ") for line in lines}
     return sorted(
         line
         for line in found
