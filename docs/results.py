@@ -14,6 +14,7 @@ import re
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 from matplotlib.figure import Figure
 
@@ -47,12 +48,26 @@ from docs.sources import ROOT
 
 PAGE = ROOT / "docs" / "results.md"
 FOLDER = ROOT / "docs" / "results"
+MEASURES = (
+    ("area", "area_low", "area_high"),
+    ("late", "late_low", "late_high"),
+    ("difference", "low", "high"),
+)
+"""Columns of the differences, and of their intervals, in a comparison."""
 ALL_TASKS = "results"
 """Marker of the tables of all tasks in the page; those of questions are their benchmarks' names."""
 MARKED = re.compile(r"(<!-- (\w+): begin -->\n).*?(<!-- \2: end -->\n)", re.DOTALL)
 HEADER = ("task", "expert", "method", "success", "steps", "environment steps", "minutes")
-COMPARED = ("task", "method", "success", "area", f"environment steps to {GOOD_RATE}", "minutes")
-DIFFERENCES = ("task", "first", "second", "seeds", "first - second", "95 % interval", "")
+COMPARED = (
+    "task",
+    "method",
+    "area",
+    "late success",
+    "last policy",
+    f"environment steps to {GOOD_RATE}",
+    "minutes",
+)
+DIFFERENCES = ("task", "first", "second", "seeds", "area", "late success", "last policy", "")
 
 
 def add(roots: Sequence[str]) -> int:
@@ -108,25 +123,31 @@ def page_with_results(text: str) -> str:
 def _question(section: Section) -> Iterator[str]:
     """Yield the lines of the answer to a question.
 
-    Differences are those to each task's best method, and all whose interval excludes zero.
+    Differences are those to each task's best method by late success, and all with an interval that
+    excludes zero.
     """
     yield f"![Success over environment steps](results/{section.title}.svg)\n"
     rows = (_compared_cells(group, section.end(group.task)) for group in section.groups)
     yield from pipes(COMPARED, *rows)
     yield ""
-    best = {group.task: group for group in sorted(section.groups, key=lambda group: group.success)}
+    late = {id(group): sum(group.late().values()) / len(group.late()) for group in section.groups}
+    best = {group.task: group for group in sorted(section.groups, key=lambda each: late[id(each)])}
     rows = (
         row
         for row in compare(section)
         if row["task"] in best
-        and (_has(row, best[row["task"]].method) or row["low"] > 0 or row["high"] < 0)
+        and (_has(row, best[row["task"]].method) or any(_excludes_zero(row, *m) for m in MEASURES))
     )
     yield from pipes(DIFFERENCES, *map(_difference, rows))
     yield ""
     yield _origin([run for group in section.groups for run in group.runs])
 
 
-def _has(row: Mapping[str, object], method: str) -> bool:
+def _excludes_zero(row: Mapping[str, Any], _: str, low: str, high: str) -> bool:
+    return row[low] > 0 or row[high] < 0
+
+
+def _has(row: Mapping[str, Any], method: str) -> bool:
     return method in (row["first"], row["second"])
 
 
@@ -135,17 +156,23 @@ def _compared_cells(group: Group, end: int) -> list[str]:
     return [
         f"`{group.task}`",
         group.method,
+        _mean(list(group.areas(end).values()), ".2f"),
+        _mean(list(group.late().values()), ".2f"),
         _unbroken(success_text(group)),
-        f"{group.area(end):.2f}",
         "–" if math.isnan(steps) else f"{steps:.0f}",
         _mean([run.result.seconds and run.result.seconds / 60 for run in group.runs]),
     ]
 
 
-def _difference(row: Mapping[str, object]) -> list[str]:
-    interval = _unbroken(f"{row['low']:+.2f} to {row['high']:+.2f}")
+def _difference(row: Mapping[str, Any]) -> list[str]:
     names = (f"`{row['task']}`", row["first"], row["second"], row["seeds"])
-    return [*map(str, names), f"{row['difference']:+.2f}", interval, str(row["reading"])]
+    cells = (
+        _unbroken(f"{row[value]:+.2f} ({row[low]:+.2f} to {row[high]:+.2f})").replace("+nan", "–")
+        if row[value] == row[value]
+        else "–"
+        for value, low, high in MEASURES
+    )
+    return [*map(str, names), *cells, str(row["reading"])]
 
 
 def _all_tasks(board: Leaderboard) -> Iterator[str]:

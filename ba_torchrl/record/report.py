@@ -27,6 +27,7 @@ from ba_torchrl.record.summary import (
     DIRECTION,
     ENOUGH_SEEDS,
     GOOD_RATE,
+    LATE,
     POOLED,
     Axis,
     Group,
@@ -50,7 +51,9 @@ class _Column(NamedTuple):
     form: str
 
     def cell(self, row: dict[str, Any]) -> str:
-        return "–" if row[self.key] != row[self.key] else self.form.format(**row)
+        return (
+            "–" if row[self.key] != row[self.key] else self.form.format(**row).replace("+nan", "–")
+        )
 
 
 class _Table(NamedTuple):
@@ -72,6 +75,7 @@ _TABLE = (
     _Column(_INTERVAL, "low", "{low:.3f} to {high:.3f}"),
     _Column("best", "best", "{best:.3f}"),
     _Column("area", "area", "{area:.3f}"),
+    _Column("late", "late", "{late:.3f}"),
     _Column(f"updates to {GOOD_RATE:.0%}", "updates_to_80", "{updates_to_80:.0f}"),
     _Column(f"steps to {GOOD_RATE:.0%}", "env_steps_to_80", "{env_steps_to_80:.0f}"),
     _Column("episode length", "mean_length", "{mean_length:.1f}"),
@@ -81,6 +85,8 @@ _COMPARISONS = (
     *_texts("task", "first", "second", "seeds"),
     _Column("difference", "difference", "{difference:+.3f}"),
     _Column(_INTERVAL, "low", "{low:+.3f} to {high:+.3f}"),
+    _Column("area", "area", "{area:+.3f} ({area_low:+.3f} to {area_high:+.3f})"),
+    _Column("late", "late", "{late:+.3f} ({late_low:+.3f} to {late_high:+.3f})"),
     _Column("", "reading", "{reading}"),
 )
 _SETTINGS = _texts("setting", "value", "methods")
@@ -93,9 +99,10 @@ _DEFINITIONS = (
     f"evaluation. Intervals and shading, {CONFIDENCE:.0%}: Student's t over seeds and the normal "
     "distribution over test scenes, never narrower than Wilson's of one run; that of a single run "
     "does not contain the spread over seeds. Area: mean success of the evaluations during training "
-    "over environment steps, to the last step of all methods on the task. To "
+    "over environment steps, to the last step of all methods on the task. Late: mean of the last "
+    f"{LATE} of these evaluations. To "
     f"{GOOD_RATE:.0%}: when the mean curve first reaches that rate. Differences are paired by seed "
-    "and test scene."
+    "and test scene, those of area and late success by seed alone."
 )
 
 

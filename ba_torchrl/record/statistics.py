@@ -8,12 +8,13 @@ scene are one cluster.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 from scipy.integrate import trapezoid
-from scipy.stats import norm, t
+from scipy.stats import norm, sem, t
 
 from ba_torchrl.record.results import TestedPolicy
 
@@ -103,6 +104,21 @@ def paired_difference(
     value = np.mean([difference.mean() for difference, _ in parts])
     half = max(Z * np.sqrt(square) / len(parts), _half_width(parts))
     return Estimate(float(value), float(max(value - half, -1)), float(min(value + half, 1)))
+
+
+def mean_difference(differences: Sequence[float]) -> Estimate:
+    """Return the mean of differences between pairs of runs with its interval of Student's t.
+
+    The interval is nan for fewer than two pairs.
+
+    Args:
+        differences: of a measure with values from 0 to 1, first minus second, of each pair.
+    """
+    value = float(np.mean(differences)) if len(differences) else math.nan
+    if len(differences) < 2:
+        return Estimate(value, math.nan, math.nan)
+    half = t.ppf(UPPER, len(differences) - 1) * sem(differences)
+    return Estimate(value, float(max(value - half, -1)), float(min(value + half, 1)))
 
 
 def area_under_success(steps: Sequence[int], rates: Sequence[float], end: int) -> float:

@@ -10,7 +10,7 @@ import itertools
 import logging
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -33,6 +33,7 @@ from ba_torchrl.record.statistics import (
     Estimate,
     area_under_success,
     mean_curve,
+    mean_difference,
     mean_success,
     paired_difference,
 )
@@ -59,6 +60,8 @@ GOOD_RATE = 0.8
 ENOUGH_SEEDS = 5
 """Least number of seeds of a comparison that is more than a direction."""
 DIRECTION = "direction only"
+LATE = 3
+"""Number of evaluations whose mean is late success."""
 ALL_TASKS = "all tasks"
 OTHER_RUNS = "runs"
 """Title of the section of runs without a benchmark."""
@@ -99,17 +102,25 @@ class Group:
 
     @property
     def curves(self) -> list[list[CurvePoint]]:
+        """Curves of all seeds that have one, of the same length; an empty one without any."""
+        return list(self.curve_by_seed.values()) or [[]]
+
+    @property
+    def curve_by_seed(self) -> dict[int, list[CurvePoint]]:
         """Curves of all seeds that have one, of the same length.
 
         The last point of a run that ended at `stop_at_success` stands for all later ones. The
         untrained policy is left out if a run lacks its evaluation.
         """
-        curves = [run.result.curve for run in self.runs]
-        if any(curve and curve[0].updates for curve in curves):
-            curves = [[point for point in curve if point.updates] for curve in curves]
-        curves = [curve for curve in curves if curve] or [[]]
-        length = max(map(len, curves))
-        return [curve + curve[-1:] * (length - len(curve)) for curve in curves]
+        curves = {run.result.seed: run.result.curve for run in self.runs}
+        if any(curve and curve[0].updates for curve in curves.values()):
+            curves = {seed: [p for p in curve if p.updates] for seed, curve in curves.items()}
+        length = max(map(len, curves.values()))
+        return {
+            seed: curve + curve[-1:] * (length - len(curve))
+            for seed, curve in curves.items()
+            if curve
+        }
 
     def axis(self, name: Axis) -> np.ndarray:
         """Return updates or environment steps at the points of the longest run's curve, [n]."""
@@ -140,12 +151,21 @@ class Group:
         """Tests of the last policies by seed of the run."""
         return {run.result.seed: run.result.last for run in self.runs}
 
-    def area(self, end: int) -> float:
-        """Return the mean over runs of the area under success over steps, until ``end``."""
-        return _mean(
-            area_under_success([p.env_steps for p in curve], [p.success_rate for p in curve], end)
-            for curve in self.curves
-        )
+    def areas(self, end: int) -> dict[int, float]:
+        """Return the area under success over steps, until ``end``, by seed of the run."""
+        return {
+            seed: area_under_success(
+                [point.env_steps for point in curve], [point.success_rate for point in curve], end
+            )
+            for seed, curve in self.curve_by_seed.items()
+        }
+
+    def late(self) -> dict[int, float]:
+        """Return the mean success of the last evaluations, `LATE`, by seed of the run."""
+        return {
+            seed: _mean(point.success_rate for point in curve[-LATE:])
+            for seed, curve in self.curve_by_seed.items()
+        }
 
     def reaches(self, rate: float) -> tuple[float, float]:
         """Return the updates and environment steps at which the mean curve reaches a rate.
@@ -309,7 +329,7 @@ def summarize(section: Section) -> list[dict[str, Any]]:
             "task": ALL_TASKS,
             **{name: min(row[name] for row in own) for name in ("seeds", "episodes")},
             **_columns("success", mean_success([group.tests for group in groups])),
-            **{name: _mean(row[name] for row in own) for name in ("best", "area", "hours")},
+            **{name: _mean(row[name] for row in own) for name in ("best", "area", "late", "hours")},
             **dict.fromkeys(("updates_to_80", "env_steps_to_80", "mean_length"), math.nan),
         }
         rows.append({**own[0], **together})
@@ -327,7 +347,8 @@ def _row(section: Section, group: Group) -> dict[str, Any]:
         "episodes": min(test.episodes for test in group.tests),
         **_columns("success", group.success),
         "best": _mean(run.result.best.success_rate for run in group.runs),
-        "area": group.area(section.end(group.task)),
+        "area": _mean(group.areas(section.end(group.task)).values()),
+        "late": _mean(group.late().values()),
         "updates_to_80": updates,
         "env_steps_to_80": steps,
         "mean_length": _mean(test.mean_length for test in group.tests),
@@ -339,23 +360,29 @@ def compare(section: Section) -> list[dict[str, Any]]:
     """Return the comparisons of the methods of a section: numbers by name, nan where there is none.
 
     There is a row per task and pair of methods, and a row of all tasks for each pair that ran on
-    every task. Runs are paired by seed, test episodes by scene.
+    every task. Runs are paired by seed, test episodes by scene. "difference" is of the tests of the
+    last policies, "area" and "late" are the differences of these measures; the reading names
+    settings besides algorithm and network in which the runs differ, unless they are what the
+    methods' names differ in.
     """
     rows = [
-        _comparison(section.title, task, [pair])
+        _comparison(section, task, [pair])
         for task in section.tasks
         for pair in itertools.combinations(section.of_task(task), 2)
     ]
     if len(section.tasks) > 1:
         for first, second in itertools.combinations(section.on_all_tasks(), 2):
             pairs = list(zip(first, second, strict=True))
-            rows.append(_comparison(section.title, ALL_TASKS, pairs))
+            rows.append(_comparison(section, ALL_TASKS, pairs))
     return rows
 
 
-def _comparison(title: str, task: str, pairs: Sequence[tuple[Group, Group]]) -> dict[str, Any]:
+def _comparison(
+    section: Section, task: str, pairs: Sequence[tuple[Group, Group]]
+) -> dict[str, Any]:
     """Return the row of two methods on one task, or on all tasks."""
-    difference, least = Estimate(math.nan, math.nan, math.nan), 0
+    difference = area = late = Estimate(math.nan, math.nan, math.nan)
+    least = 0
     if obstacles := sorted({name for pair in pairs for name in _obstacles(*pair)}):
         reading = f"not compared: {', '.join(obstacles)}"
     else:
@@ -365,16 +392,48 @@ def _comparison(title: str, task: str, pairs: Sequence[tuple[Group, Group]]) -> 
             tests.append([[group.by_seed[seed] for seed in seeds] for group in pair])
         least = min(len(first) for first, _ in tests)
         difference = paired_difference(tests)
-        reading = DIRECTION if least < ENOUGH_SEEDS else ""
+        area = _difference(
+            [[group.areas(section.end(group.task)) for group in pair] for pair in pairs]
+        )
+        late = _difference([[group.late() for group in pair] for pair in pairs])
+        notes = [DIRECTION] if least < ENOUGH_SEEDS else []
+        if names := sorted({name for pair in pairs for name in _beside(*pair)}):
+            notes.append(f"also differ in {', '.join(names)}")
+        reading = "; ".join(notes)
     return {
-        "benchmark": title,
+        "benchmark": section.title,
         "task": task,
         "first": pairs[0][0].method,
         "second": pairs[0][1].method,
         "seeds": least,
         **_columns("difference", difference),
+        **_columns("area", area, "area_"),
+        **_columns("late", late, "late_"),
         "reading": reading,
     }
+
+
+def _difference(pairs: Sequence[Sequence[Mapping[int, float]]]) -> Estimate:
+    """Return the difference of a measure, first minus second, over tasks and common seeds.
+
+    Args:
+        pairs: of each task, the measure of both methods by seed.
+    """
+    common = set.intersection(*(set(values) for pair in pairs for values in pair))
+    found = [_mean(pair[0][seed] - pair[1][seed] for pair in pairs) for seed in sorted(common)]
+    return mean_difference(found)
+
+
+def _beside(first: Group, second: Group) -> Iterator[str]:
+    """Yield the settings besides algorithm and network in which two methods differ.
+
+    Those of methods whose labels have the same algorithm and network, and that differ in a variant
+    of both, are what is compared.
+    """
+    if first.runs[0].result.label.split()[:2] != second.runs[0].result.label.split()[:2]:
+        for name in first.runs[0].differences(second.runs[0]):
+            if name.partition(".")[0] not in ("algorithm", "network", *POOLED):
+                yield name
 
 
 def _obstacles(first: Group, second: Group) -> list[str]:
@@ -403,8 +462,8 @@ def _printed(character: str) -> str:
     return character if character.isprintable() or character == "\N{NO-BREAK SPACE}" else " "
 
 
-def _columns(name: str, found: Estimate) -> dict[str, float]:
-    return {name: found.value, "low": found.low, "high": found.high}
+def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:
+    return {name: found.value, f"{prefix}low": found.low, f"{prefix}high": found.high}
 
 
 def _mean(values: Iterable[float]) -> float:

@@ -148,6 +148,8 @@ def test_the_records_of_a_question_are_compared(tmp_path, records):
     assert "results/mine.svg" in text
     first, second, difference = re.findall(rf"^\| `{REACH}` .*", text, flags=re.MULTILINE)
     assert [row.split(" | ")[1] for row in (first, second)] == ["first", "second"]
-    assert first.split(" | ")[3] > second.split(" | ")[3]
-    assert difference.split(" | ")[1:5] == ["first", "second", "2", "+0.50"]
+    assert first.split(" | ")[4] > second.split(" | ")[4]  # of the last policy
+    *names, area, _, last, _ = difference.split(" | ")
+    assert names[1:] == ["first", "second", "2"]
+    assert (area.split(" ")[0], last.split(" ")[0]) == ("+0.13", "+0.50")
     assert difference.endswith("direction only |")

@@ -266,6 +266,23 @@ def test_runs_of_other_versions_are_rows_of_their_own_whose_names_say_so(tmp_pat
     assert len(methods) == (name in ("protocol", "precision", "policy_file"))
 
 
+def test_comparisons_have_area_and_late_success_and_name_settings_beside_the_arms(tmp_path):
+    arms = {"sac cnn": ((0.0, 0.2, 0.4), {}), "sac equi": ((0.4, 0.8, 0.6), {"demonstrations": 9})}
+    arms["sac equi more"] = ((1, 1, 1), {"demonstrations": 99})
+    for label, (rates, config) in arms.items():
+        for seed in range(2):
+            changed = {**config, "algorithm": {"name": "sac"}, "network": {"name": label}}
+            write_run(tmp_path / f"{label}{seed}", rates, seed=seed, label=label, config=changed)
+    (section,) = load(tmp_path)
+    rows = {(row["first"], row["second"]): row for row in compare(section)}
+    row = rows["sac cnn", "sac equi"]
+    assert (row["area"], row["late"]) == pytest.approx(
+        (-0.45, -0.4), abs=1e-3
+    )  # of 0.2 and 0.65, 0.2 and 0.6
+    assert row["reading"] == "direction only; also differ in demonstrations"
+    assert rows["sac equi", "sac equi more"]["reading"] == "direction only"
+
+
 def test_benchmarks_have_sections_and_other_runs_are_last(tmp_path):
     for name in (None, "close_loop_4d", "close_loop_3d"):
         write_run(tmp_path / str(name), (0, 0, 1), benchmark=name)
@@ -514,7 +531,7 @@ def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):
     rows = {(row[0], row[1]): row for row in page.rows[1:] if len(row) == len(page.rows[0])}
     assert len(rows) == 6
     assert rows[REACH, "sacfd equi"][2:6] == ["2", "10", "0.900", "0.596 to 1.000"]
-    assert rows[REACH, "sacfd equi"][8] == "300"
+    assert rows[REACH, "sacfd equi"][8:10] == ["0.633", "300"]
     assert rows["all tasks", "sacfd equi"][4] == "0.900"
 
     def table(name):

@@ -4,11 +4,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest, norm
+from scipy.stats import binomtest, norm, ttest_1samp
 
 from ba_torchrl.record.statistics import (
     area_under_success,
     mean_curve,
+    mean_difference,
     mean_success,
     paired_difference,
     wilson,
@@ -86,6 +87,14 @@ def test_the_interval_of_a_paired_difference_holds_it():
         return high - low, paired_difference([(runs(first), runs(second))])
 
     assert 0.92 <= share_inside(simulate) <= 0.99
+
+
+def test_the_interval_of_differences_of_runs_is_that_of_a_t_test():
+    values = [0.1, 0.4, -0.2, 0.3, 0.25]
+    low, high = ttest_1samp(values, 0).confidence_interval(0.95)
+    assert mean_difference(values) == pytest.approx((np.mean(values), low, high))
+    assert mean_difference([1.0, -0.6])[1:] == (-1, 1)
+    assert np.isnan(mean_difference([0.5])).tolist() == [False, True, True]
 
 
 def test_pairs_of_scenes_narrow_the_interval_of_a_difference():
