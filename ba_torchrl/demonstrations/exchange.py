@@ -280,7 +280,12 @@ def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays
     for key, entry in entries.items():
         if entry.name not in arrays:
             raise ConfigError(f"the file has no {entry.name!r}, which its card names")
-        values = np.asarray(entry_of(arrays, entry.name))
+        stored, is_observed = entry_of(arrays, entry.name), entry.role == "observation"
+        if entry.dtype != "str":  # before the values are read
+            rows = sum(stored.shape[:1])
+            has_first = not is_observed and form.has_row_before_first_step(entry.name)
+            check_rows(entry.name, rows - (has_first and rows > steps), steps, is_observed)
+        values = np.asarray(stored)
         if entry.dtype == "str":
             text = np.resize(values.astype(str).reshape(-1), steps + 1)
             now[key], following[key] = (
@@ -295,11 +300,9 @@ def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays
                     f"{entry.name} has the shape {values.shape[1:]}, its card says {entry.shape}"
                 )
             values = values[..., None]
-        is_observed = entry.role == "observation"
         if not is_observed and form.has_row_before_first_step(entry.name) and len(values) > steps:
             values = values[1:] if entry.role == "result" else values[:-1]
         rows = torch.from_numpy(np.array(values, dtype=entry.dtype))
-        check_rows(entry.name, len(values), steps, is_observed)
         if is_observed:
             if len(rows) == steps:
                 rows = torch.cat([rows, rows[-1:]])

@@ -62,6 +62,9 @@ class Source(StrictModel):
             if self.components is not None:
                 if found.ndim < 2:
                     raise IndexError("has one number per step, no components")
+                last = found.shape[-1]  # NumPy does not check the indices of an array without rows
+                if out := [i for i in self.components if not -last <= i < last]:
+                    raise IndexError(f"components {out} are out of bounds")
                 found = found[..., self.components]
             if self.scale == 1.0 and self.offset == 0.0:
                 return found
@@ -172,7 +175,8 @@ class MappedFile:
         episodes = []
         for number, stored in enumerate(read_file(self._form, self._path)):
             with naming_episode(self._path, number):
-                episodes.append(self._entries(stored, reads=reads))
+                entries = self._entries(stored, reads=False)  # before any value is read
+                episodes.append(self._entries(stored, reads=True) if reads else entries)
         return episodes
 
     def _entries(self, stored: StoredArrays, *, reads: bool) -> Arrays:

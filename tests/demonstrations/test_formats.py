@@ -482,13 +482,89 @@ def test_hdf5_is_read_where_it_is_mapped_and_checked_by_shapes(tmp_path, monkeyp
     check_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
     assert read == []
     for changes, message in (
-        ({"depth": "obs/camera"}, r"depth: has the shape \[1048576, 1048576\], needed"),
+        ({"depth": "obs/camera"}, "depth: 805306368 of 805306368 parts of .*camera were never"),
+        ({"depth": "obs/state"}, r"depth: has the shape \[2\], needed"),
         ({"success": "obs/nothing"}, "success has 0 rows, and there are 3 actions"),
         ({"reward": "obs/state"}, r"reward: has the shape \[2\], needed one number"),
         ({"instruction": "ep_meta/lang"}, "instruction: there is no 'ep_meta/lang'"),
     ):
         with pytest.raises(ConfigError, match=f"episode 0: {message}"):
             check_demonstrations(path, task=TASK, env=ENV, mapping={**FOREIGN, **changes})
+
+
+def never_written(demo, how):
+    """Replace `obs/depth` of an episode by a dataset of which a part was never written."""
+    depth = demo["obs/depth"][:]
+    del demo["obs/depth"]
+    options = {"name": "obs/depth", "shape": depth.shape, "dtype": depth.dtype}
+    if how == "next":
+        demo["obs/depth"] = depth
+        demo.create_dataset(**{**options, "name": "next_obs/depth"})
+    elif how == "chunk":
+        demo.create_dataset(**options, chunks=(1, *depth.shape[1:]))[: len(depth) - 1] = depth[:-1]
+    elif how == "all":
+        demo.create_dataset(**options)
+    elif how == "external":
+        demo.create_dataset(**options, external="/dev/zero")
+    else:
+        layout = h5py.VirtualLayout(shape=depth.shape, dtype=depth.dtype)
+        sources = {"lost": "none.hdf5", "part": ".", "whole": "."}
+        demo["stored"] = depth
+        source = h5py.VirtualSource(sources[how], f"{demo.name}/stored", depth.shape)
+        rows = len(depth) - (how == "part")
+        layout[:rows] = source[:rows]
+        demo.create_virtual_dataset("obs/depth", layout)
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("chunk", r"1 of 3 parts of /data/demo_0/obs/depth were never written.* as 0"),
+        ("all", "1 of 1 parts of /data/demo_0/obs/depth were never written"),
+        ("next", "1 of 1 parts of /data/demo_0/next_obs/depth were never written"),
+        ("external", "the values of /data/demo_0/obs/depth are in other files"),
+        (
+            "lost",
+            "/data/demo_0/stored of .*none.hdf5, a part of /data/demo_0/obs/depth, is missing",
+        ),
+        ("part", "4096 of 12288 values of /data/demo_0/obs/depth have no source"),
+        ("whole", None),
+    ],
+)
+def test_parts_of_hdf5_that_were_never_written_are_refused(how, message, tmp_path):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        never_written(file["data/demo_0"], how)
+        file["data/demo_0/unused"] = np.zeros((3, 5))
+    for read in (check_demonstrations, load_demonstrations):
+        if message is None:
+            read(path, task=TASK, env=ENV, mapping=FOREIGN)
+            continue
+        with pytest.raises(ConfigError, match=f"episode 0: depth: {message}"):
+            read(path, task=TASK, env=ENV, mapping=FOREIGN)
+
+
+def test_numbers_of_a_file_agree(tmp_path, collected):
+    path = foreign(tmp_path / "a.hdf5")
+    with h5py.File(path, "a") as file:
+        file["data/demo_1"].attrs["num_samples"] = 3
+    with pytest.raises(ConfigError, match="demo_1 has 2 actions, and its num_samples is 3"):
+        load_demonstrations(path, task=TASK, env=ENV, mapping=FOREIGN)
+    path = exported(tmp_path, collected, "minari")
+    mapping = {name: f"observations/{name}" for name in ("depth", "holding")}
+    options = {"task": TASK, "env": ENV, "mapping": {**mapping, "action": "actions"}}
+    assert len(load_demonstrations(path, **options)) == 2
+    metadata = path / "data/metadata.json"
+    text = metadata.read_text()
+    for count in ("1", "3", str(10**12)):
+        metadata.write_text(text.replace('"total_episodes": 2', f'"total_episodes": {count}'))
+        with pytest.raises(ConfigError, match=f"holds 2 episodes, .*json counts {count}"):
+            load_demonstrations(path, **options)
+    metadata.write_text(text)
+    with h5py.File(path / "data/main_data.hdf5", "a") as file:
+        file["episode_1/actions"].resize((10**7, 5))
+    with pytest.raises(ConfigError, match=r"main_data\.hdf5: .* parts of /episode_1/actions were"):
+        load_demonstrations(path, **options)
 
 
 @pytest.mark.parametrize(
@@ -639,13 +715,18 @@ def foreign_zarr(path, version=2, **changes):
     }
     root = zarr_group(path, version)
     for name, rows in arrays.items():
-        options = {"shape": rows.shape, "dtype": rows.dtype, "chunks": (2, *rows.shape[1:])}
-        if hasattr(root, "create_array"):
-            array = root.create_array(name, **options, config={"write_empty_chunks": True})
-        else:
-            array = root.create_dataset(name, **options)
-        array[:] = rows
+        store_zarr(root, name, rows)
     return path
+
+
+def store_zarr(root, name, rows):
+    options = {"shape": rows.shape, "dtype": rows.dtype, "chunks": (2, *rows.shape[1:])}
+    options["overwrite"] = True
+    if hasattr(root, "create_array"):
+        array = root.create_array(name, **options, config={"write_empty_chunks": True})
+    else:
+        array = root.create_dataset(name, **options)
+    array[:] = rows
 
 
 ZARR = {
@@ -693,9 +774,11 @@ def test_a_missing_chunk_of_zarr_is_refused(name, version, is_zip, tmp_path):
         file for file in (path / name).rglob("*") if file.name[0].isdecimal() and file.is_file()
     )
     chunks[-1].unlink()
+    if not is_zip:
+        chunks[-1].mkdir()  # is no chunk
     mapped = zipped(path) if is_zip else path
     for read in (check_demonstrations, load_demonstrations):
-        with pytest.raises(ConfigError, match=rf"1 of 3 chunks of {name} are missing, .*Copy"):
+        with pytest.raises(ConfigError, match=rf"number 3 of 3, of {name} is missing; .*Copy"):
             read(mapped, task=TASK, env=ENV, mapping=ZARR)
     if name == "data/success":
         others = {key: source for key, source in ZARR.items() if key != "success"}
@@ -705,13 +788,66 @@ def test_a_missing_chunk_of_zarr_is_refused(name, version, is_zip, tmp_path):
 def test_a_zarr_folder_without_its_ends_is_refused(tmp_path):
     path = foreign_zarr(tmp_path / "a.zarr")
     options = {"task": TASK, "env": ENV, "mapping": ZARR}
-    for ends, message in (([3, 4], r"has the shape \[5.*end at \[4\]"), ([3, 3], "do not rise")):
-        zarr.open(str(path), mode="a")["meta/episode_ends"][:] = ends
+    for ends, message in (
+        ([3, 4], r"has the shape \[5.*end at \[4\]"),
+        ([3, 3], "do not rise"),
+        ([3, 6.7], "episode_ends: the end 6.7 is no whole number of steps"),
+        ([3, np.nan], "the end nan is no"),
+        ([*range(1, 7)], "there are 6 ends, and 5 steps in data"),
+        ([[3, 5]], "needed one whole number per episode"),
+    ):
+        store_zarr(zarr.open_group(str(path), mode="a"), "meta/episode_ends", np.array(ends))
         with pytest.raises(ConfigError, match=message):
             load_demonstrations(path, **options)
+    store_zarr(zarr.open_group(str(path), mode="a"), "meta/episode_ends", np.array([3.0, 5.0]))
+    assert len(load_demonstrations(path, **options)) == 2
     (path / "meta/episode_ends/0").unlink()
-    with pytest.raises(ConfigError, match="1 of 1 chunks of meta/episode_ends are missing"):
+    with pytest.raises(ConfigError, match=r"number 1 of 1, of meta/episode_ends is missing"):
         load_demonstrations(path, **options)
+
+
+@needs_zarr_3
+def test_a_missing_chunk_inside_a_shard_of_zarr_is_refused(tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr", 3)
+    options = {"shape": (5, 5), "dtype": "f8", "chunks": (4, 5), "overwrite": True}
+    for location in ("start", "end"):
+        codec = zarr.codecs.ShardingCodec(chunk_shape=(1, 5), index_location=location)
+        data = zarr.open_group(str(path / "data"), mode="a")
+        array = data.create_array("action", **options, serializer=codec, compressors=None)
+        array[:] = 0.5
+        assert len(load_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)) == 2
+        array[1] = 0  # zarr leaves it out
+        message = r"inner chunk \(1, 0\), the first of 1, of the shard .* of data/action is missing"
+        for mapped in (path, zipped(path)):
+            with pytest.raises(ConfigError, match=message):
+                check_demonstrations(mapped, task=TASK, env=ENV, mapping=ZARR)
+    shard = path / "data/action/c/0/0"
+    shard.write_bytes(shard.read_bytes()[:9])
+    with pytest.raises(ConfigError, match="action: the shard data/action/c/0/0 is damaged"):
+        check_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)
+    data.create_array("action", **options, serializer=codec, compressors=zarr.codecs.ZstdCodec())
+    data["action"][:] = 0.5
+    with pytest.raises(ConfigError, match="the codecs of its shards do not show"):
+        check_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)
+
+
+def test_a_truncated_archive_is_damaged(tmp_path):
+    archive = zipped(foreign_zarr(tmp_path / "a.zarr"))
+    archive.write_bytes(archive.read_bytes()[:-100])
+    for mapping in (ZARR, None):
+        with pytest.raises(DamagedFilesError, match="a damaged zip archive: it has no end"):
+            load_demonstrations(archive, task=TASK, env=ENV, mapping=mapping)
+
+
+def test_a_header_of_zarr_of_many_rows_is_refused_quickly(tmp_path):
+    path = foreign_zarr(tmp_path / "a.zarr")
+    for name in ("data/action", "meta/episode_ends"):
+        header = path / name / ".zarray"
+        values = json.loads(header.read_text())
+        values["shape"][0] = 10**12  # of each chunk, a name would need terabytes
+        header.write_text(json.dumps(values))
+        with pytest.raises(ConfigError, match=f"of 500000000000, of {name} is missing"):
+            check_demonstrations(path, task=TASK, env=ENV, mapping=ZARR)
 
 
 def test_an_instruction_that_was_not_observed_is_that_of_the_task(episodes, tmp_path):

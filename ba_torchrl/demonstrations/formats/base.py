@@ -62,8 +62,12 @@ class Rows:
     def then(self, last: Any) -> Rows:
         """Return these rows and one more, the last one of ``last``."""
         shape = (sum(self.shape[:1]) + 1, *self.shape[1:])
+        fault = self.fault or getattr(last, "fault", "")
         return replace(
-            self, shape=shape, read=lambda: np.concatenate([self, np.asarray(last)[-1:]])
+            self,
+            shape=shape,
+            read=lambda: np.concatenate([self, np.asarray(last)[-1:]]),
+            fault=fault,
         )
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import math
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.demonstrations.formats.base import (
     FORMATS,
     Arrays,
@@ -87,21 +89,27 @@ class Robomimic(Format):
             data = file["data"]
             demos = [name for name in data if isinstance(data.get(name), h5py.Group)]
             for demo in sorted(demos, key=lambda name: (len(name), name)):
-                datasets = dict(_datasets(h5py, data[demo]))
+                datasets = dict(datasets_below(data[demo]))
                 arrays: dict[str, Any] = {}
                 for name, dataset in datasets.items():
                     arrays[name] = _rows(h5py, dataset)
                     following = datasets.get(name.replace(_OBS, _NEXT_OBS, 1))
                     if name.startswith(_OBS) and following is not None:
                         arrays[name] = arrays[name].then(_rows(h5py, following, np.s_[-1:]))
+                rows = sum(getattr(datasets.get("actions"), "shape", ())[:1])
+                samples = data[demo].attrs.get("num_samples", rows)
+                if rows and np.all(samples != rows):
+                    raise ConfigError(
+                        f"{path}: {demo} has {rows} actions, and its num_samples is {samples}"
+                    )
                 if language := _language(data[demo].attrs.get("ep_meta", "")):
                     arrays[_LANGUAGE] = np.array([language])
                 episodes.append(arrays)
         return episodes
 
 
-def _datasets(h5py: Any, group: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:
-    """Yield the datasets below a group by their paths, links of any kind included.
+def datasets_below(group: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:
+    """Yield the datasets below a group of h5py by their paths, links of any kind included.
 
     Args:
         above: the groups around it, which a link may name again.
@@ -109,11 +117,12 @@ def _datasets(h5py: Any, group: Any, above: tuple[Any, ...] = ()) -> Iterator[tu
     above = (*above, group)
     for name in group:
         item = group.get(name)  # None for a link without a target
-        if isinstance(item, h5py.Dataset):
+        if hasattr(item, "keys"):
+            if item not in above:
+                for below, dataset in datasets_below(item, above):
+                    yield f"{name}/{below}", dataset
+        elif hasattr(item, "shape"):
             yield name, item
-        elif isinstance(item, h5py.Group) and item not in above:
-            for below, dataset in _datasets(h5py, item, above):
-                yield f"{name}/{below}", dataset
 
 
 def _rows(h5py: Any, dataset: Any, part: Any = ()) -> Rows:
@@ -124,7 +133,53 @@ def _rows(h5py: Any, dataset: Any, part: Any = ()) -> Rows:
         with h5py.File(file, "r") as opened:
             return opened[name][part]
 
-    return Rows(dataset.shape or (), dataset.dtype, read)
+    return Rows(dataset.shape or (), dataset.dtype, read, unwritten(dataset))
+
+
+def unwritten(dataset: Any) -> str:
+    """Return why a dataset of h5py cannot be used: HDF5 reads parts that were never written as its
+    fill value; empty if all of it was written."""
+    if not dataset.size:  # None for a dataset without a value
+        return ""
+    if dataset.external:
+        return f"the values of {dataset.name} are in other files, which are not read; copy them in"
+    if dataset.is_virtual:
+        return _unwritten_of_sources(dataset)
+    if dataset.chunks is None:
+        parts, written = 1, int(dataset.id.get_storage_size() > 0)
+    else:
+        sides = zip(dataset.shape, dataset.chunks, strict=True)
+        parts = math.prod(-(-length // side) for length, side in sides)
+        written = dataset.id.get_num_chunks()
+    if written >= parts:
+        return ""
+    return (
+        f"{parts - written} of {parts} parts of {dataset.name} were never written, as by a program "
+        f"that was stopped; HDF5 reads them as {dataset.fillvalue}. Copy the file again, or delete "
+        f"the episode. If they are meant: h5py.File(FILE, 'r+')['{dataset.name}'][:] = the values"
+    )
+
+
+def _unwritten_of_sources(dataset: Any) -> str:
+    """Return why a virtual dataset cannot be used; see `unwritten`."""
+    import h5py
+
+    mapped = 0
+    for source in dataset.virtual_sources():
+        name = dataset.file.filename
+        if source.file_name != ".":
+            name = os.path.join(os.path.dirname(name), source.file_name)
+        try:
+            with h5py.File(name, "r") as file:
+                fault = unwritten(file[source.dset_name])
+        except (OSError, KeyError):
+            fault = f"{source.dset_name} of {name}, a part of {dataset.name}, is missing"
+        if fault:
+            return fault
+        mapped += source.vspace.get_select_npoints()
+    if mapped < dataset.size:
+        return f"{dataset.size - mapped} of {dataset.size} values of {dataset.name} have no source"
+    return ""
 
 
 def _language(meta: str | bytes) -> str | None:

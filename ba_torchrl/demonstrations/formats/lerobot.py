@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError, DamagedFilesError
 from ba_torchrl.demonstrations.formats.base import FORMATS, Arrays, Card, Entry, Format
 
 _STATES = ("proprio", keys.OBSERVATION, keys.HOLDING)
@@ -17,6 +19,8 @@ _STATES = ("proprio", keys.OBSERVATION, keys.HOLDING)
 _STATE, _TASK, _DONE = "observation.state", "task", "next.done"
 _VIDEO_BACKEND = "pyav"
 """The decoder that needs no FFmpeg on the system."""
+_LOCAL = "local"
+"""No version of LeRobot's format: of such a revision, LeRobot does not ask the Hub for versions."""
 _OWN = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 """Entries that LeRobot adds."""
 
@@ -74,19 +78,89 @@ class LeRobot(Format):
 
     def read(self, path: Path) -> list[Arrays]:
         """Read by `LeRobotDataset`: depth in metres, colours as uint8."""
-        datasets = self.library("lerobot.datasets.lerobot_dataset")
-        dataset = datasets.LeRobotDataset(
-            f"ba_torchrl/{path.name}",
-            root=path,
-            depth_output_unit="m",
-            video_backend=_VIDEO_BACKEND,
-        )
+        dataset = self._local_dataset(path)
         cameras = set(dataset.meta.camera_keys) - set(dataset.meta.depth_keys)
         episodes: dict[int, list[dict[str, Any]]] = {}
         for i in range(len(dataset)):
             frame = dataset[i]
             episodes.setdefault(int(frame["episode_index"]), []).append(frame)
-        return [_stacked(frames, cameras) for _, frames in sorted(episodes.items())]
+        total = dataset.meta.total_episodes
+        if sorted(episodes) != list(range(total)):
+            raise ConfigError(
+                f"{path}: data/ has the episodes {_listed(episodes)}, and meta/info.json counts "
+                f"{total} (total_episodes), which begin at 0"
+            )
+        return [
+            _stacked(_in_order(path, number, episodes[number]), cameras) for number in range(total)
+        ]
+
+    def _local_dataset(self, path: Path) -> Any:
+        """Return LeRobot's data set, of files of the folder only, which agree in their numbers."""
+        metadata = self.library("lerobot.datasets.dataset_metadata").LeRobotDatasetMetadata
+        datasets = self.library("lerobot.datasets.lerobot_dataset")
+        name = f"ba_torchrl/{path.name}"
+        try:
+            meta = _local(metadata, "_pull_from_repo")(name, path, _LOCAL)
+        except (FileNotFoundError, NotADirectoryError) as error:
+            raise DamagedFilesError(
+                f"{path} is incomplete: {error}; copy it again with all of its files"
+            ) from None
+        total = len(meta.episodes or ())
+        if meta.total_episodes != total:
+            raise ConfigError(
+                f"{path}: meta/info.json counts {meta.total_episodes} episodes (total_episodes), "
+                f"and meta/episodes has {total}"
+            )
+        for number in range(total):
+            videos = [meta.get_video_file_path(number, key) for key in meta.video_keys]
+            for file in (meta.get_data_file_path(number), *videos):
+                if not (path / file).is_file():
+                    raise DamagedFilesError(f"{path / file} is missing; copy it again")
+        dataset = _local(datasets.LeRobotDataset, "_download")(
+            name,
+            root=path,
+            revision=_LOCAL,
+            depth_output_unit="m",
+            video_backend=_VIDEO_BACKEND,
+        )
+        rows = len(dataset.hf_dataset)
+        if len(dataset) != rows:
+            raise ConfigError(
+                f"{path}: meta/info.json counts {len(dataset)} frames (total_frames), and data/ "
+                f"has {rows}"
+            )
+        return dataset
+
+
+def _local(base: type, download: str) -> type:
+    """Return a class of LeRobot that does not load from the Hub what the folder lacks."""
+
+    def refuse(self: Any, *_: object, **__: object) -> None:
+        if isinstance(sys.exc_info()[1], OSError):  # of the file that is missing
+            raise
+        raise DamagedFilesError(
+            f"{self.root} is incomplete: data/ lacks episodes of meta/; copy it again"
+        )
+
+    return type(base.__name__, (base,), {download: refuse})
+
+
+def _in_order(path: Path, number: int, frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return the frames of an episode in the order of their `frame_index`."""
+    frames = sorted(frames, key=lambda frame: int(frame["frame_index"]))
+    found = [int(frame["frame_index"]) for frame in frames]
+    if found != list(range(len(frames))):
+        raise ConfigError(
+            f"{path}, episode {number}: frame_index is {_listed(found)}, needed each number from 0 "
+            f"to {len(frames) - 1} once"
+        )
+    return frames
+
+
+def _listed(numbers: Iterable[int]) -> str:
+    """Return numbers in words, the first ones of many."""
+    found = sorted(numbers)
+    return ", ".join(map(str, found[:8])) + ", ..." * (len(found) > 8)
 
 
 def _stacked(frames: list[dict[str, Any]], cameras: set[str]) -> Arrays:

@@ -25,6 +25,7 @@ from ba_torchrl.demonstrations.formats.base import (
     flatten,
     rows_of,
 )
+from ba_torchrl.demonstrations.formats.hdf5 import datasets_below, unwritten
 from ba_torchrl.envs.registration import gym_id, register_task
 
 _ROOT = "MINARI_DATASETS_PATH"
@@ -133,8 +134,10 @@ class Minari(Format):
         Those of nested spaces are named ``observations/a/b``.
         """
         minari = self.library("minari")
+        storage = minari.dataset.minari_storage.MinariStorage.read(path / "data")
+        self._check_complete(path / "data", storage.total_episodes)
         episodes = []
-        for episode in minari.MinariDataset(path / "data").iterate_episodes():
+        for episode in minari.MinariDataset(storage).iterate_episodes():
             found = {
                 name: values
                 for place in (*_FIXED.values(), _OBSERVATIONS[:-1], _INFOS[:-1])
@@ -142,6 +145,24 @@ class Minari(Format):
             }
             episodes.append({name: rows_of(values) for name, values in found.items()})
         return episodes
+
+    def _check_complete(self, data: Path, total: int) -> None:
+        """Check that the files have all episodes of the metadata, and all of their values."""
+        file = data / "main_data.hdf5"
+        if not file.is_file():  # Minari's other storage: a folder per episode
+            found = sum(part.is_dir() and part.name.isdecimal() for part in data.iterdir())
+        else:
+            with self.library("h5py").File(file, "r") as opened:
+                found = len(opened)
+                for episode in opened:
+                    for _, dataset in datasets_below(opened[episode]):
+                        if fault := unwritten(dataset):
+                            raise ConfigError(f"{file}: {fault}")
+        if found != total:
+            raise ConfigError(
+                f"{data} holds {found} episodes, and its metadata.json counts {total} "
+                "(total_episodes)"
+            )
 
 
 def _check_space(folder: Path, episodes: Sequence[Arrays]) -> None:
