@@ -277,6 +277,62 @@ def test_lerobot_has_its_names(episodes, tmp_path):
     assert {"action", "next.reward", "next.done", "next.success"} <= features.keys()
 
 
+def edit_table(file, change):
+    """Rewrite a parquet file with the rows, columns and types that ``change`` returns."""
+    parquet = pytest.importorskip("pyarrow.parquet")
+    table = parquet.read_table(file)
+    parquet.write_table(change(table), file)
+
+
+@pytest.mark.parametrize("order", [[1, 0, 2], [2, 1, 0]])
+def test_lerobot_rows_are_read_in_the_order_of_their_frames(order, episodes, tmp_path):
+    pytest.importorskip("lerobot")
+    path = exported(tmp_path, episodes, "lerobot")
+    without_checksums(path)
+    edit_table(path / LEROBOT_DATA, lambda table: table.take([*order, *range(3, len(table))]))
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
+
+
+LEROBOT_DATA = "data/chunk-000/file-000.parquet"
+
+
+def without_checksums(path):
+    card = path / "card.json"
+    card.write_text(json.dumps({**json.loads(card.read_text()), "checksums": {}}))
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (LEROBOT_DATA, "data/chunk-000/file-000.parquet is missing; copy it again"),
+        ("meta/tasks.parquet", "is incomplete: .*tasks.parquet.*; copy it again with all"),
+        ("meta/episodes/chunk-000/file-000.parquet", "is incomplete: .*meta/episodes"),
+        ({"total_episodes": 2}, r"counts 2 episodes \(total_episodes\), and meta/episodes has 3"),
+        ({"total_episodes": 10**12}, "counts 1000000000000 episodes"),
+        ({"total_frames": 8}, "counts 8 frames .*, and data/ has 9"),
+        ([*range(9), 8], "and data/ has 10"),
+        ([*range(5)], r"data/ lacks episodes of meta/"),
+        ([0, 1, 1, *range(3, 9)], r"episode 0: frame_index is 0, 1, 1, needed each number from 0"),
+    ],
+)
+def test_lerobot_folders_with_lost_files_or_numbers_are_refused_without_the_hub(
+    damage, message, episodes, tmp_path, monkeypatch
+):
+    pytest.importorskip("lerobot")
+    path = exported(tmp_path, episodes, "lerobot")
+    without_checksums(path)
+    if isinstance(damage, str):
+        (path / damage).unlink()
+    elif isinstance(damage, dict):
+        info = path / "meta/info.json"
+        info.write_text(json.dumps({**json.loads(info.read_text()), **damage}))
+    else:
+        edit_table(path / LEROBOT_DATA, lambda table: table.take(damage))
+    monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.exit("the network was used"))
+    with pytest.raises(ConfigError, match=message):
+        load_demonstrations(path, task=TASK, env=ENV)
+
+
 # Another robot's teleoperation: depth in millimetres with channels last, an action of
 # (x, y, z, yaw, gripper) in metres, radians and opening.
 FOREIGN = {
