@@ -97,8 +97,8 @@ def run_all(
             tqdm.write("stopping: the present runs save their states")
         for job in running:
             job.terminate()
-        for job in running:
-            job.stop()
+        while [job for job in running if not job.has_ended()]:
+            time.sleep(POLL_S)
         bar.close()
     return failures
 
@@ -134,22 +134,22 @@ class _Job:
         self, run: ExperimentConfig, worker: Sequence[str], max_hours: float | None
     ) -> None:
         self.run = run
-        self._deadline = None if max_hours is None else time.monotonic() + 3600 * max_hours
+        self._deadline = math.inf if max_hours is None else time.monotonic() + 3600 * max_hours
+        self._kill_at = math.inf
         self._first: tuple[float, int] | None = None
         """Time and update at the first reading of the run's scalars."""
         self._timed_out = False
-        self._is_asked_to_end = False
         run.folder.mkdir(parents=True, exist_ok=True)
-        self._log = (run.folder / LOG_FILE).open("a")
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
-        self._process = subprocess.Popen(
-            worker,
-            stdin=subprocess.PIPE,
-            stdout=self._log,
-            stderr=self._log,
-            text=True,
-            start_new_session=True,  # a group that can be ended as a whole, with its environments
-        )
+        with (run.folder / LOG_FILE).open("a") as log:
+            self._process = subprocess.Popen(
+                worker,
+                stdin=subprocess.PIPE,
+                stdout=log,
+                stderr=log,
+                text=True,
+                start_new_session=True,  # a group that is ended as a whole, with its environments
+            )
         try:
             with self._process.stdin as stdin:
                 stdin.write(run.model_dump_json())
@@ -174,15 +174,22 @@ class _Job:
         return f"update {updates}/{total}{left}: {self}"
 
     def has_ended(self) -> bool:
-        """Whether the process has ended; one that exceeds its time limit is ended here."""
-        if self._deadline is not None and time.monotonic() > self._deadline:
+        """Whether the process has ended.
+
+        A process that exceeds its time limit is asked to end here, and one that does not save its
+        state in time is killed with its child processes.
+        """
+        seen = time.monotonic()
+        if seen > self._deadline:
             self._timed_out = True
-            self.stop()
+            self.terminate()
+        if self._process.poll() is None and seen > self._kill_at:
+            os.killpg(self._process.pid, signal.SIGKILL)
+            self._process.wait()
         return self._process.poll() is not None
 
     def close(self) -> str | None:
         """Record how the process ended; return the reason of a failure, None otherwise."""
-        self._log.close()
         code = self._process.returncode
         if status(self.run).state == "done":
             return None
@@ -204,17 +211,6 @@ class _Job:
 
     def terminate(self) -> None:
         """Ask the process, once, to save its state and end."""
-        if not self._is_asked_to_end and self._process.poll() is None:
-            self._is_asked_to_end = True
+        if self._kill_at == math.inf and self._process.poll() is None:
+            self._kill_at = time.monotonic() + SAVE_S
             self._process.terminate()
-
-    def stop(self) -> None:
-        """End the process, which saves its state first; kill it and its child processes if it does
-        not end in time."""
-        self.terminate()
-        try:
-            self._process.wait(SAVE_S)
-        except subprocess.TimeoutExpired:
-            os.killpg(self._process.pid, signal.SIGKILL)
-            self._process.wait()
-        self._log.close()

@@ -39,6 +39,15 @@ if order == "die":
     os.kill(os.getpid(), signal.SIGSEGV)
 if order == "hang":
     time.sleep(1000)
+if order == "save":  # until the third run starts
+    signal.signal(signal.SIGTERM, lambda *_: (folder / "asked").touch())
+    while not (folder / "asked").exists() or not (folder.parent / "seed2" / "calls").exists():
+        time.sleep(0.05)
+    (folder / "met").touch()
+    sys.exit()
+if order == "wait":  # until the first run saves
+    while not (folder.parent / "seed0" / "asked").exists():
+        time.sleep(0.05)
 if order == "meet":  # needs another one at the same time
     for _ in range(2400):
         if len(list(folder.parent.glob("*/calls"))) == 2:
@@ -132,11 +141,19 @@ def test_a_finished_run_of_another_version_is_refused(tmp_path, fake, monkeypatc
     assert status(run).state == "done"  # no expert took part
 
 
-def test_a_run_that_exceeds_its_time_limit_is_stopped(tmp_path, fake):
-    runs = planned(tmp_path)
-    failures = fake(runs, {0: "hang"}, max_hours=10 / 3600)
-    assert failures == {runs[0].folder: "took longer than max_hours"}
-    assert status(runs[1]).state == "done"
+def test_a_run_that_exceeds_its_time_limit_saves_its_state_and_blocks_no_other(tmp_path, fake):
+    runs = planned(tmp_path, seeds=3)
+    failures = fake(runs, {0: "save", 1: "wait"}, max_hours=8 / 3600, jobs=2)
+    assert (runs[0].folder / "met").exists()
+    assert failures[runs[0].folder] == "took longer than max_hours"
+    assert status(runs[2]).state == "done"
+
+
+def test_a_run_that_does_not_save_its_state_in_time_is_killed(tmp_path, fake, monkeypatch):
+    monkeypatch.setattr(jobs, "SAVE_S", 0.1)
+    runs = planned(tmp_path, seeds=1)
+    assert fake(runs, {0: "save"}, max_hours=2 / 3600).keys() == {runs[0].folder}
+    assert not (runs[0].folder / "met").exists()
 
 
 def test_jobs_run_at_the_same_time(tmp_path, fake):
@@ -154,7 +171,8 @@ def test_the_bar_shows_the_update_and_the_estimated_time_of_a_run(tmp_path, fake
         if content is not None:
             rows.open("a").write(content)
         seen.append(job.progress())
-    job.stop()
+    job.terminate()
+    job._process.wait()
     name = f"{REACH} sac small seed 0"
     assert seen == [name, name, f"update 0/100: {name}", f"update 25/100, 03:00 left: {name}"]
 
