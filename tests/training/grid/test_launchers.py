@@ -1,10 +1,15 @@
 """Grids on a Ray cluster."""
 
+import io
+import multiprocessing
 import threading
 import time
+import weakref
 from pathlib import Path
 
 import pytest
+from tqdm import tqdm
+from tqdm.std import TqdmDefaultWriteLock
 
 from ba_torchrl.core.config import parse
 from ba_torchrl.core.errors import ConfigError
@@ -56,6 +61,26 @@ def test_a_task_stops_at_its_time_limit_with_its_state_saved(tmp_path, monkeypat
     with pytest.raises(TimeoutError, match=r"max_hours.*SIGTERM, state saved"):
         ray_launcher._run_in_task(run.model_dump_json(), max_hours=1e-4)
     assert (run.folder / "run.log").exists()
+
+
+def test_a_task_leaves_no_semaphore_whose_tracker_ray_ends(tmp_path, monkeypatch):
+    (run,) = planned(tmp_path, seeds=1)
+    left = []
+
+    class Cycle:
+        def __init__(self):
+            self.itself, self.semaphore = self, multiprocessing.get_context("spawn").Lock()
+
+    def experiment(_):
+        tqdm(total=1, disable=False, file=io.StringIO()).close()
+        left.append(weakref.ref(Cycle().semaphore))
+
+    for owner, name in ((tqdm, "_lock"), (TqdmDefaultWriteLock, "mp_lock")):
+        monkeypatch.delattr(owner, name, raising=False)
+    monkeypatch.setattr(ray_launcher, "run_experiment", experiment)
+    ray_launcher._run_in_task(run.model_dump_json(), max_hours=None)
+    assert left[0]() is None
+    assert not hasattr(TqdmDefaultWriteLock, "mp_lock")
 
 
 @pytest.mark.slow

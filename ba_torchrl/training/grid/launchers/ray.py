@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import logging
 import os
 import signal
@@ -108,7 +109,12 @@ def _reason(reference: Any) -> str | None:
 
 
 def _run_in_task(values: str, max_hours: float | None) -> None:
-    """Run an experiment in this process, with the run folder's log file."""
+    """Run an experiment in this process, with the run folder's log file.
+
+    Ray ends the child processes of this one before the exit of Python, among them the tracker of
+    semaphores. Those that exist until then would be reported as lost, so none does.
+    """
+    tqdm.set_lock(threading.RLock())  # in place of a semaphore
     folder = Path(ExperimentConfig.model_validate_json(values).run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     handler = logging.FileHandler(folder / LOG_FILE)
@@ -127,3 +133,4 @@ def _run_in_task(values: str, max_hours: float | None) -> None:
     finally:
         timer.cancel()
         logging.getLogger().removeHandler(handler)
+        gc.collect()
