@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Mapping
+from numbers import Real
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
@@ -20,7 +22,31 @@ from pydantic_core import CoreSchema
 
 from ba_torchrl.core.errors import ConfigError, SettingsError, UnknownNameError
 
-Interval = tuple[float, float]
+
+def numbers_of(values: Any, what: str, count: int = 2) -> tuple[float, ...]:
+    """Return the numbers of a list, a tuple or an array as floats.
+
+    Args:
+        values: as a user gave them.
+        what: is needed, in words.
+        count: of the numbers.
+
+    Raises:
+        ValueError: there are more or fewer, or one of them is text or a boolean.
+    """
+    values = values.tolist() if hasattr(values, "tolist") else values
+    found = values if isinstance(values, list | tuple) else ()
+    is_number = [isinstance(x, Real) and not isinstance(x, bool) for x in found]
+    if len(is_number) != count or not all(is_number):
+        raise ValueError(f"must be {what}")
+    return tuple(float(x) for x in found)
+
+
+def _pair(values: Any) -> Any:
+    return numbers_of(values, "a (low, high) pair of numbers")
+
+
+Interval = Annotated[tuple[float, float], BeforeValidator(_pair)]
 
 MAX_ENVS = 1024
 """Largest number of environments of a vector: PyBullet's number of worlds."""

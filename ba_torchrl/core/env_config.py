@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
-from ba_torchrl.core.config import Interval, StrictModel, TaskParameters
+from ba_torchrl.core.config import Interval, StrictModel, TaskParameters, numbers_of
 from ba_torchrl.core.errors import ConfigError
 
 Rgb = tuple[float, float, float]
@@ -128,34 +128,28 @@ class EnvConfig(StrictModel):
     def _as_pairs(cls, value: Any) -> Any:
         if value is None:
             return None
-        try:  # lists and arrays, as configuration files and the paper write them
-            pairs = tuple(tuple(float(x) for x in pair) for pair in value)
-        except TypeError:
-            pairs = ()
-        if [len(pair) for pair in pairs] != [2, 2, 2]:
-            raise ValueError("must be three (low, high) pairs for x, y and z")
-        return pairs
+        what = "three (low, high) pairs of numbers for x, y and z"
+        if not isinstance(value, list | tuple) or len(value) != 3:
+            raise ValueError(f"must be {what}")
+        return tuple(numbers_of(pair, what) for pair in value)
 
     @field_validator("object_scale_range", mode="before")
     @classmethod
     def _as_range(cls, value: Any) -> Any:
-        if isinstance(value, bool):
-            raise ValueError("must be a number or a (low, high) pair")
-        if isinstance(value, int | float):
-            return (float(value), float(value))
-        return value
+        if value is None:
+            return None
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return numbers_of([value] * 2 if is_number else value, "a number or a (low, high) pair")
 
     @field_validator("floor_color", "workspace_color", mode="before")
     @classmethod
     def _as_color(cls, value: Any) -> Any:
         if value is None:
             return None
-        try:
-            color = tuple(float(x) for x in value)
-        except TypeError:
-            color = ()
-        if len(color) != 3 or not all(0 <= x <= 1 for x in color):
-            raise ValueError("must be red, green and blue from 0 to 1")
+        what = "red, green and blue from 0 to 1"
+        color = numbers_of(value, what, 3)
+        if not all(0 <= x <= 1 for x in color):
+            raise ValueError(f"must be {what}")
         return color
 
     @model_validator(mode="after")

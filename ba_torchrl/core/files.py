@@ -12,12 +12,14 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import functools
 import json
 import logging
 import os
 import re
 import shutil
 import socket
+import time
 import zlib
 from codecs import BOM_UTF8
 from collections.abc import Iterator, Mapping
@@ -42,6 +44,8 @@ _DATA_SUFFIXES = frozenset({".json", ".safetensors"})
 _TEXT_SUFFIXES = frozenset({".md", ".txt"})
 _TENSORS_FILE, _VALUES_FILE = "tensors.safetensors", "values.json"
 _CHUNK = 1 << 20
+_SETTLED_S = 2.0
+"""Age of a file's last change from which another change has another time in the file system."""
 _SCRATCH = re.compile(r"\.\d+\.[0-9a-f]{6}\.")
 """Begin of the names that `replaced` yields."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
@@ -375,7 +379,17 @@ def _files(folder: Path) -> Iterator[Path]:
 
 
 def fingerprint(path: Path) -> tuple[int, int]:
-    """Return length and CRC-32 of a file."""
+    """Return length and CRC-32 of a file; they are computed once while it is unchanged."""
+    found = path.stat()
+    if time.time() - found.st_ctime < _SETTLED_S:
+        return _fingerprint.__wrapped__(path, ())
+    state = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+    return _fingerprint(path.absolute(), state)
+
+
+@functools.lru_cache(maxsize=4096)
+def _fingerprint(path: Path, state: tuple[int, ...]) -> tuple[int, int]:
+    """Read a file for `fingerprint`; ``state`` changes with its content."""
     size = checksum = 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):

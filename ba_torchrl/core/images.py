@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -9,7 +10,8 @@ import torch
 from torch import Tensor
 from torchrl.data import Bounded
 
-from ba_torchrl.core.errors import check_choice
+from ba_torchrl.core.config import numbers_of
+from ba_torchrl.core.errors import ConfigError, check_choice
 
 Storage = Literal["uint8", "float16", "exact"]
 """Type of an image in the replay: 255 equal steps over its range, half precision, or unchanged."""
@@ -50,6 +52,13 @@ class ImageSpec:
     def __post_init__(self) -> None:
         check_choice("storage", self.storage, Storage)
         check_choice("frame", self.frame, Frame)
+        given, what = (self.low, self.high), "finite numbers low < high"
+        try:
+            low, high = numbers_of(given, what)
+        except ValueError as error:
+            raise ConfigError(f"range of an image: {error}, not {given}") from None
+        if not -math.inf < low < high < math.inf:
+            raise ConfigError(f"range of an image: must be {what}, not {given}")
 
     @property
     def shape(self) -> tuple[int, int, int]:

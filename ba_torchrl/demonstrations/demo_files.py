@@ -33,7 +33,7 @@ from ba_torchrl.demonstrations.exchange import (
     env_values,
     import_demonstrations,
 )
-from ba_torchrl.demonstrations.formats.base import find_format
+from ba_torchrl.demonstrations.formats.base import find_format, read_card
 from ba_torchrl.tasks.base import TASKS, versions_of
 
 logger = logging.getLogger(__name__)
@@ -206,7 +206,9 @@ def _is_own(path: Path, mapping: object) -> bool:
     is_own = os.path.exists(path / METADATA_FILE)
     if is_own and mapping is not None:
         raise ConfigError(f"{path} has our entries; leave out the mapping (demonstrations_mapping)")
-    return is_own or (mapping is None and find_format(path) is None)
+    if is_own or mapping is not None:
+        return is_own
+    return find_format(path) is None and read_card(path) is None
 
 
 def read_metadata(path: Path) -> dict[str, Any]:

@@ -209,6 +209,8 @@ def count_demonstrations(
 def _format(path: Path) -> Format:
     form = find_format(path)
     if form is None:
+        if card := read_card(path):  # of an export that has lost a file
+            check_files(path, card)
         raise ConfigError(f"no demonstrations at {path} in the formats {', '.join(FORMATS)}")
     return form
 

@@ -27,7 +27,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import StrictModel, expanded, explain
+from ba_torchrl.core.config import Interval, StrictModel, expanded, explain
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError, UnknownNameError, check_choice
 from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
 from ba_torchrl.core.hardware import hardware
@@ -98,7 +98,7 @@ class PolicyCard(StrictModel):
     """Gradient updates of the policy."""
     success_rate: float
     """Of the policy's test, whose record is exact."""
-    interval: tuple[float, float]
+    interval: Interval
     """Wilson's interval of the success rate, 95 %."""
     episodes: int
     """Number of episodes of the test."""

@@ -135,6 +135,23 @@ def test_files_that_a_library_would_unpickle_are_refused(folder, name):
             opened(folder)
 
 
+def test_checksums_are_computed_once_while_a_file_is_unchanged(folder, monkeypatch):
+    computed = []
+    crc32 = files.zlib.crc32
+    monkeypatch.setattr(files.zlib, "crc32", lambda *args: computed.append(1) or crc32(*args))
+    monkeypatch.setattr(files, "_SETTLED_S", 0)
+    check(folder)
+    first = len(computed)
+    check(folder)
+    assert len(computed) == first > 0
+    file = weights_of(folder)
+    content = file.read_bytes()
+    file.unlink()
+    file.write_bytes(content[::-1])
+    with pytest.raises(DamagedFilesError, match="was altered"):
+        check(folder)
+
+
 def test_a_full_disk_is_an_error_of_the_system(tmp_path, monkeypatch):
     def full(*_):
         raise SafetensorError("Error while serializing: I/O error: No space left (os error 28)")

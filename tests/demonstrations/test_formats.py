@@ -737,6 +737,8 @@ def test_a_card_that_does_not_fit_its_file_is_refused(damage, message, episodes,
             "observations.safetensors is missing",
         ),
         ("minari", "picking-v0/data/main_data.hdf5", "main_data.hdf5 is missing"),
+        ("minari", "picking-v0/data/metadata.json", "metadata.json is missing"),
+        ("zarr", "picking.zarr/.zgroup", ".zgroup is missing"),
     ],
 )
 def test_an_export_that_was_altered_is_refused(name, damage, message, collected, tmp_path):
