@@ -5,6 +5,9 @@ from __future__ import annotations
 import itertools
 import statistics
 import time
+from collections.abc import Iterator
+from contextlib import closing
+from typing import Any
 
 import numpy as np
 import pybullet
@@ -61,18 +64,15 @@ They and the reference's durations are for two idle cores of a Xeon with AMX.
 """
 
 
-def _expert_actions(task: str, episodes: int) -> list[list[Tensor]]:
-    """Return the actions of the expert's first episodes."""
-    env = make(task, seed=SEED, expert=True)
-    played: list[list[Tensor]] = []
-    for _ in range(episodes):
-        state, actions = env.reset(), []
-        while not actions or not state[keys.DONE]:
-            actions.append(state[keys.EXPERT_ACTION].clone())
-            state = env.step(state.set(keys.ACTION, actions[-1]))[keys.NEXT]
-        played.append(actions)
-    env.close()
-    return played
+def expert_episodes(task: str, **settings: Any) -> Iterator[list[Tensor]]:
+    """Yield the actions of the expert's episodes, which an environment of `SEED` can repeat."""
+    with closing(make(task, seed=SEED, expert=True, **settings)) as env:
+        while True:
+            state, actions = env.reset(), []
+            while not actions or not state[keys.DONE]:
+                actions.append(state[keys.EXPERT_ACTION].clone())
+                state = env.step(state.set(keys.ACTION, actions[-1]))[keys.NEXT]
+            yield actions
 
 
 @measurement("simulation/step", over=lambda: zip(list_tasks()))
@@ -84,7 +84,7 @@ def step_and_reset(bench: Bench, task: str) -> list[Row]:
     unit = SimulationUnit()
     env = make(task, seed=SEED)
     steps, resets, units, physics = [], [], [], []
-    episodes = _expert_actions(task, bench.repeats)
+    episodes = list(itertools.islice(expert_episodes(task), bench.repeats))
     for number in bench.rounds():
         units += [seconds(unit) for _ in range(5)]
         start = time.perf_counter()
@@ -116,7 +116,7 @@ def physics_share(bench: Bench, task: str) -> list[Row]:
     unit = SimulationUnit()
     env = make(task, seed=SEED)
     steps, physics, units = [], [], []
-    episodes = _expert_actions(task, bench.repeats)
+    episodes = list(itertools.islice(expert_episodes(task), bench.repeats))
     for number in bench.rounds():
         state = env.reset()
         world = env.scene.world
@@ -169,7 +169,7 @@ def expert_action(bench: Bench, task: str) -> list[Row]:
     """
     unit = SimulationUnit()
     envs = [make(task, seed=SEED, expert=expert) for expert in (True, False)]
-    episodes = _expert_actions(task, bench.repeats)
+    episodes = list(itertools.islice(expert_episodes(task), bench.repeats))
     times: list[list[float]] = [[], []]
     units = []
     for number in bench.rounds():
