@@ -144,6 +144,13 @@ class SimulationError(RuntimeError):
     """The simulator failed, or was asked for something it cannot do."""
 
 
+class RepeatedFaultError(SimulationError):
+    """The simulator failed in many episodes in a row, probably because of the task's code.
+
+    It ends a run, where another `SimulationError` ends an episode.
+    """
+
+
 class PlacementError(RuntimeError):
     """No free place was found for the objects; the workspace is too small for them."""
 

@@ -320,6 +320,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         set_state: bool = False,
         state: TensorDictBase | None = None,
     ) -> TensorDict:
+        self._fault_counter.episodes.count_reset()
         if set_state:
             return self._set_state(tensordict if state is None else state)
         if state is not None:
@@ -344,11 +345,11 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
                 success = valid and all(self._conditions.values())
                 self._observation = self._observe(scene)
                 before, self._progress = self._progress, self._measure_progress(scene)
-        except SIMULATOR_ERRORS:
+        except SIMULATOR_ERRORS as error:
             fault, self._conditions = True, dict.fromkeys(self._condition_names, False)
-            self._on_fault()
+            self._on_fault(error)
         else:
-            self._fault_counter.count_step()
+            self._fault_counter.episodes.count_step()
         # the dense rewards that would follow a success belong to its value
         cuts_rewards = success and self.config.reward == "dense"
         terminated = not fault and not cuts_rewards and (success or not valid)
@@ -483,8 +484,8 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
                     observation = self._observe(scene)
                     check_entries(observation, self.observation_spec)
                     return observation
-            except SIMULATOR_ERRORS:
-                self._on_fault()
+            except SIMULATOR_ERRORS as error:
+                self._on_fault(error)
 
     @contextlib.contextmanager
     def _acting(self) -> Iterator[None]:
@@ -529,7 +530,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         progress = 0.0 if self._ends[keys.TERMINATED] else self._progress
         return sparse + self.config.reward_discount * progress - progress_before
 
-    def _on_fault(self) -> None:
+    def _on_fault(self, error: Exception) -> None:
         """Close the worlds and count the fault; the next episode builds a new world."""
         self._episodes.close()
-        self._fault_counter.count_fault()
+        self._fault_counter.count_fault(error)

@@ -82,6 +82,8 @@ class FakeEnv(EnvBase):
                     raise KeyError("colour")
                 if order == "private mistake":
                     raise type("PrivateError", (Exception,), {})("colour")
+                if order == "unprintable mistake":
+                    raise type("PrivateError", (Exception,), {"__str__": lambda _: 1 / 0})
                 if order == "exit":
                     sys.exit(0)
                 if order.endswith("raise"):

@@ -13,9 +13,8 @@ from torchrl.envs import EnvBase, ParallelEnv, check_env_specs
 
 import ba_torchrl
 from ba_torchrl import BulletArmEnv
-from ba_torchrl.core.errors import InvalidActionError, SimulationError
+from ba_torchrl.core.errors import InvalidActionError
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
-from ba_torchrl.envs import faults
 from ba_torchrl.envs.checks import checked_action
 from ba_torchrl.tasks.base import TASKS
 
@@ -139,19 +138,6 @@ class OnDevice(torch.Tensor):
 def test_an_action_may_be_on_another_device():
     action = torch.tensor([0.5, 0.0, -0.5]).as_subclass(OnDevice)
     assert checked_action(action, "task", "pxy").tolist() == [0.5, 0.0, -0.5]
-
-
-def test_repeated_faults_are_an_error(env, monkeypatch):
-    monkeypatch.setattr(faults, "MAX_CONSECUTIVE_FAULTS", 2)
-    monkeypatch.setattr("ba_torchrl.sim.control.close_loop.CloseLoopController.move_to", _fail)
-    for _ in range(2):
-        assert env.step(env.reset().set("action", torch.zeros(5)))["next", "fault"]
-    with pytest.raises(SimulationError, match="3 times in a row"):
-        env.step(env.reset().set("action", torch.zeros(5)))
-
-
-def _fail(*_):
-    raise SimulationError("the solver exploded")
 
 
 def test_collectors_reset_each_environment_on_its_own():

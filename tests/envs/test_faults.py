@@ -7,8 +7,9 @@ import pybullet
 import pytest
 import torch
 
-from ba_torchrl.core.errors import SimulationError
+from ba_torchrl.core.errors import RepeatedFaultError, SimulationError
 from ba_torchrl.envs import faults
+from ba_torchrl.envs.vector.worker import is_of_code
 from ba_torchrl.sim.world import World
 from ba_torchrl.testing.episodes import image_of
 
@@ -144,8 +145,28 @@ def test_a_reset_that_always_fails_is_an_error(make, monkeypatch):
 
     monkeypatch.setattr(faults, "MAX_CONSECUTIVE_FAULTS", 2)
     monkeypatch.setattr(env.task_class, "initialize_episode", fail)
-    with pytest.raises(SimulationError, match="3 times in a row"):
+    with pytest.raises(RepeatedFaultError, match=r"2 times in a row.*error: no server$"):
         env.reset()
+
+
+def test_a_fault_in_every_episode_is_an_error(make, monkeypatch):
+    monkeypatch.setattr(faults, "MAX_CONSECUTIVE_FAULTS", 3)
+    env = make()
+
+    def fail_after_a_step():
+        state = step(env, env.reset())
+        give_nan(env)
+        return step(env, state)["fault"]
+
+    for _ in range(2):
+        assert fail_after_a_step()
+        assert fail_after_a_step()
+        step(env, env.reset())  # the next reset ends an undisturbed episode
+    assert fail_after_a_step()
+    assert fail_after_a_step()
+    with pytest.raises(RepeatedFaultError, match=r"3 times in a row.*is not finite$") as raised:
+        fail_after_a_step()
+    assert is_of_code(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError, WorkerError
 from ba_torchrl.envs.episode_positions import EpisodePosition
+from ba_torchrl.envs.faults import MAX_CONSECUTIVE_FAULTS, DisturbedEpisodes
 from ba_torchrl.envs.vector.batching import MakeEnv, Vector
 from ba_torchrl.envs.vector.worker import EnvironmentRaisedError, Worker
 
@@ -82,6 +83,7 @@ class VectorEnv(Vector):
         self._lost: set[int] = set()
         """Indices of environments that must be reset, because their worker was replaced."""
         self._failures_in_a_row = [0] * num_workers
+        self._episodes = [DisturbedEpisodes() for _ in range(num_workers)]
         self._replaced_since_seed = [0] * num_workers
 
     @property
@@ -150,6 +152,8 @@ class VectorEnv(Vector):
 
     def _reset_some(self, options: Mapping[int, dict[str, Any]], *, is_full: bool) -> None:
         self._start_or_replace_dead()
+        for index in options.keys() - self._lost:
+            self._episodes[index].count_reset()
         remaining = set(options)
         while remaining:
             self._finish_starts(wait_for_all=is_full or self.wait_for_restarts)
@@ -175,6 +179,8 @@ class VectorEnv(Vector):
         for index, texts in answers.items():
             self._read(index, texts)
             self._failures_in_a_row[index] = 0
+            episodes = self._episodes[index]
+            episodes.count_fault() if self._rows[index][keys.FAULT] else episodes.count_step()
         self._replace_failed(failures)
         self._finish_starts(wait_for_all=self.wait_for_restarts)
         if len(self._starts) == self.num_workers:
@@ -302,6 +308,10 @@ class VectorEnv(Vector):
         for index, cause in sorted(failures.items()):
             self._failures_in_a_row[index] += 1
             self._check_limit(index, self._failures_in_a_row[index], "completing a step", cause)
+            episodes = self._episodes[index]
+            episodes.count_fault()
+            if episodes.in_a_row >= MAX_CONSECUTIVE_FAULTS:
+                self._check_limit(index, episodes.in_a_row, "an undisturbed episode", cause)
         self._replace(failures)
 
     def _replace(self, causes: Mapping[int, WorkerError], attempts: int = 0) -> None:

@@ -12,6 +12,7 @@ import sys
 import threading
 import time
 import traceback
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from functools import cache
@@ -19,7 +20,7 @@ from multiprocessing import resource_tracker, util
 from multiprocessing.connection import Connection
 from multiprocessing.context import SpawnProcess
 from multiprocessing.process import BaseProcess
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import torch
 from tensordict import TensorDict, TensorDictBase
@@ -28,10 +29,11 @@ from torchrl.data import NonTensor
 from typing_extensions import Self
 
 from ba_torchrl.core.config import WorkerOptions
-from ba_torchrl.core.errors import ConfigError, WorkerError
+from ba_torchrl.core.errors import ConfigError, RepeatedFaultError, WorkerError
 from ba_torchrl.envs.vector.batching import MakeEnv
 from ba_torchrl.sim.world import SIMULATOR_ERRORS
 
+T = TypeVar("T")
 Slot = tuple[TensorDictBase, TensorDictBase]
 
 _PR_SET_PDEATHSIG = 1
@@ -55,33 +57,53 @@ class SentError(NamedTuple):
     @classmethod
     def of(cls, error: BaseException) -> Self:
         """Return an exception of this process."""
-        try:
-            pickled = pickle.dumps(error)
-        except Exception:  # whatever the methods of its class raise
-            pickled = b""
-        summary = f"{type(error).__name__}: {error}"
-        return cls(pickled, summary, "".join(traceback.format_exception(error)))
+        name = type(error).__name__
+        summary = _attempt(lambda: f"{name}: {error}", f"{name}, which cannot be printed")
+        text = _attempt(lambda: "".join(traceback.format_exception(error)), summary)
+        return cls(_attempt(lambda: pickle.dumps(error), b""), summary, text)
+
+    def shortened(self) -> Self:
+        """Return it with less than 64 KiB, which a pipe holds while nobody reads.
+
+        A large exception arrives as its summary.
+        """
+
+        def part(text: str, half: int) -> str:
+            return text if len(text) <= 2 * half else f"{text[:half]} ... {text[-half:]}"
+
+        pickled = self.pickled if len(self.pickled) < 2**13 else b""
+        return type(self)(pickled, part(self.summary, 2**10), part(self.text, 2**12))
 
     def received(self) -> Exception:
         """Return the exception, whose cause is an `EnvironmentRaisedError` with the traceback.
 
         It is a RuntimeError if this process cannot make one of that type, or that would end it.
         """
-        try:
-            error = pickle.loads(self.pickled)
-        except Exception:  # whatever the methods of its class raise, or there is no such class
-            error = None
-        if not isinstance(error, Exception):
-            error = RuntimeError(self.summary)
-        error.__cause__ = EnvironmentRaisedError(f"it raised\n{self.text}")
-        return error
+        cause = EnvironmentRaisedError(f"it raised\n{self.text}")
+        error = _attempt(lambda: _caused(pickle.loads(self.pickled), cause), None)
+        return error if isinstance(error, Exception) else _caused(RuntimeError(self.summary), cause)
+
+
+def _attempt(function: Callable[[], T], default: T) -> T:
+    """Return a result, or a default if the class of an author's exception lets it fail."""
+    try:
+        return function()
+    except Exception:
+        return default
+
+
+def _caused(error: Exception, cause: Exception) -> Exception:
+    error.__cause__ = cause
+    return error
 
 
 def is_of_code(error: Exception) -> bool:
     """Return whether an error would occur again in a new process.
 
-    Those of the simulator and of the machine's memory may not.
+    Those of the simulator and of the machine's memory may not, unless they are repeated.
     """
+    if isinstance(error, RepeatedFaultError):
+        return True
     return not isinstance(error, (*SIMULATOR_ERRORS, WorkerError, MemoryError))
 
 

@@ -148,16 +148,19 @@ class MultiCollection(WorkerCollection):
 
         Raises:
             RuntimeError: there were too many in a row, with those at the start of new workers.
-            Exception: a worker sent it.
+            Exception: a worker sent it, and it would occur again in a new process.
         """
         self.close()
         if not self._errors.empty():
-            raise self._errors.get().received()
+            error = self._errors.get().received()
+            if is_of_code(error):
+                raise error
+            cause = error.__cause__
         self._failures_in_a_row += 1
         if self._failures_in_a_row > self.problem.workers.max_restarts:
             raise failed_too_often(self._failures_in_a_row, cause) from cause
+        self.count_restart(cause)
         self._restarts += 1
-        self.scalars["restarts"] = self._restarts
         logger.warning("workers are replaced (restart %d): %s", self._restarts, cause)
         try:
             self._collector = self._start()
@@ -168,7 +171,7 @@ class MultiCollection(WorkerCollection):
 
 
 class _WorkersCollector(Collector):
-    """TorchRL's collector in a worker process, which sends errors of the code to the parent.
+    """TorchRL's collector in a worker process, which sends its error to the parent.
 
     Args:
         errors: where to.
@@ -183,8 +186,7 @@ class _WorkersCollector(Collector):
         try:
             yield from super().iterator()
         except Exception as error:
-            if is_of_code(error):
-                self._errors.put(SentError.of(error))
+            self._errors.put(SentError.of(error).shortened())
             raise
 
 

@@ -17,6 +17,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.envs.faults import MAX_CONSECUTIVE_FAULTS
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem, CollectorConfig
 
 VERSION = "policy_version"
@@ -93,20 +94,37 @@ class WorkerCollection(Collection):
         self.config = config
         self.policy = VersionedPolicy(problem.algorithm.policy)
         self.scalars = {"lag": 0.0, "restarts": 0}
+        self._disturbed_in_a_row = 0
+        """Number of restarts since the end of an undisturbed episode."""
 
     def __next__(self) -> TensorDict:
         while True:
             batch = self.collect().reshape(-1)
             version = batch.pop(VERSION)
             if (version == NO_WEIGHTS).any():  # of a worker that was replaced during the batch
-                self.scalars["restarts"] += 1
+                self.count_restart(RuntimeError("a worker process has ended"))
                 continue
+            following = batch[keys.NEXT]
+            if (following[keys.DONE] & ~following[keys.FAULT]).any():
+                self._disturbed_in_a_row = 0
             self.scalars["lag"] = (self.problem.algorithm.updates - version).float().mean().item()
             return batch
 
     @abstractmethod
     def collect(self) -> TensorDict:
         """Send the weights of `policy`, and return the transitions of one batch."""
+
+    def count_restart(self, cause: Exception) -> None:
+        """Count the replacement of workers after a failure.
+
+        Raises:
+            RuntimeError: there were too many without an undisturbed episode in between.
+        """
+        self.scalars["restarts"] += 1
+        self._disturbed_in_a_row += 1
+        limit = max(self.problem.workers.max_restarts + 1, MAX_CONSECUTIVE_FAULTS)
+        if self._disturbed_in_a_row >= limit:
+            raise failed_too_often(self._disturbed_in_a_row, cause) from cause
 
     def weights(self) -> TensorDict:
         """Return a copy of the weights and their version, on the CPU."""
@@ -151,7 +169,7 @@ class WorkerCollection(Collection):
 
 
 def failed_too_often(failures: int, cause: Exception) -> RuntimeError:
-    """Return the error of workers that failed more than ``max_restarts`` times in a row."""
+    """Return the error of workers that failed too often in a row; see `WorkerOptions`."""
     return RuntimeError(
         f"the collector's workers failed {failures} times in a row; the last time: {cause}. Raise "
         "max_restarts, or use collector=single to see the error where it happens"

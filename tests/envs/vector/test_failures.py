@@ -1,6 +1,7 @@
 import logging
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 from functools import partial
@@ -14,6 +15,7 @@ from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError, WorkerError
 from ba_torchrl.envs.vector import parallel
 from ba_torchrl.envs.vector.parallel import VectorEnv
+from ba_torchrl.envs.vector.worker import SentError
 
 
 class TestFailures:
@@ -146,14 +148,25 @@ class TestFailures:
         assert env.is_closed
         assert multiprocessing.active_children() == []
 
-    def test_with_steps_in_between_do_not_add_up(self, make_fakes, tmp_path):
+    def test_with_steps_in_between_add_up_until_an_episode_is_undisturbed(
+        self, make_fakes, tmp_path, monkeypatch
+    ):
+        monkeypatch.setattr(parallel, "MAX_CONSECUTIVE_FAULTS", 3)
         env = make_fakes(1, folder=tmp_path, max_restarts=1)
-        state = env.reset()
-        for _ in range(3):
+
+        def fail_after_a_step(state):
+            _, state = env.step_and_maybe_reset(act(env, state))
             (tmp_path / f"{env.worker_pids[0]}.step").write_text("raise")
-            _, state = env.step_and_maybe_reset(act(env, state))
-            _, state = env.step_and_maybe_reset(act(env, state))
-        assert env.restarts == 3
+            return env.step_and_maybe_reset(act(env, state))[1]
+
+        for _ in range(2):
+            state = fail_after_a_step(fail_after_a_step(env.reset()))
+            env.step(act(env, state))
+        state = fail_after_a_step(fail_after_a_step(env.reset()))
+        assert env.restarts == 6
+        with pytest.raises(RuntimeError, match=r"(?s)3 times without an undisturbed.*exploded"):
+            fail_after_a_step(state)
+        assert env.is_closed
 
     def test_in_endless_resets_raise(self, make_fakes, tmp_path):
         env = make_fakes(2, folder=tmp_path, max_restarts=2)
@@ -169,6 +182,7 @@ class TestFailures:
             ("refuse", ConfigError, "the task is wrong"),
             ("mistake", KeyError, "'colour'"),
             ("private mistake", RuntimeError, "PrivateError: colour"),
+            ("unprintable mistake", RuntimeError, "PrivateError, which cannot be printed"),
             ("exit", RuntimeError, "SystemExit: 0"),
         ],
     )
@@ -185,6 +199,13 @@ class TestFailures:
         state = env.reset()
         assert_stepped(env.step(act(env, state.clone())), 1, state)
         assert (env.restarts, env.worker_pids) == (0, pids)
+
+    def test_of_any_size_fit_into_a_pipe(self):
+        for message, kind in (("colour", KeyError), ("\N{SNOWMAN}" * 10**6, RuntimeError)):
+            sent = SentError.of(KeyError(message)).shortened()
+            assert len(pickle.dumps(sent)) < 2**16
+            assert type(sent.received()) is kind
+            assert str(sent.received()).startswith(("'colour'", "KeyError: '\N{SNOWMAN}"))
 
     def test_to_build_raise_with_the_cause(self, tmp_path):
         env = VectorEnv(

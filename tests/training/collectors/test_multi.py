@@ -9,6 +9,7 @@ from unittest.mock import Mock
 
 import pytest
 import torch
+from tensordict import TensorDict
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
@@ -16,7 +17,8 @@ from ba_torchrl.envs.vector.batching import SerialVectorEnv
 from ba_torchrl.envs.vector.parallel import VectorEnv
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
-from ba_torchrl.training.collectors import multi
+from ba_torchrl.training.collectors import multi, workers
+from ba_torchrl.training.collectors.workers import VERSION
 from ba_torchrl.training.experiment import Experiment
 from tests.training.collectors.runs import (
     assert_each_transition_once,
@@ -212,6 +214,31 @@ def test_a_start_that_fails_is_a_failure_in_a_row(max_restarts, starts, tmp_path
         with pytest.raises(RuntimeError, match="failed 3 times in a row; the last time: no start"):
             collection.collect()
     assert FailingCollector.count == starts
+    collection.close()
+
+
+@pytest.mark.parametrize("done", [True, False])
+def test_failures_add_up_until_an_episode_is_undisturbed(done, tmp_path, monkeypatch):
+    flags = {keys.DONE: torch.tensor([[done]]), keys.FAULT: torch.zeros(1, 1, dtype=torch.bool)}
+    batch = TensorDict({VERSION: torch.zeros(1, 1), keys.NEXT: flags}, [1])
+
+    class EndsAfterABatch(FailingCollector):
+        count = 4
+
+        def __iter__(self):
+            yield batch.clone()
+            raise EOFError("the end")
+
+    monkeypatch.setattr(workers, "MAX_CONSECUTIVE_FAULTS", 3)
+    monkeypatch.setattr(multi, "MultiSyncCollector", EndsAfterABatch)
+    options = {"name": "multi_sync", "workers": 2}
+    collection, _ = start(config_for(tmp_path, options, max_restarts=1))
+    if done:
+        assert len(list(itertools.islice(collection, 6))) == 6
+        assert collection.scalars["restarts"] == 5
+    else:
+        with pytest.raises(RuntimeError, match="failed 3 times in a row; the last time: the end"):
+            list(itertools.islice(collection, 6))
     collection.close()
 
 
