@@ -63,9 +63,20 @@ def write_text(path: str | Path, text: str) -> Path:
         text: its content.
     """
     path = Path(path)
-    with replaced(path) as scratch:
+    with naming(path), replaced(path) as scratch:
         scratch.write_text(text, encoding="utf-8")
     return path
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Context whose errors of the system name a path, if they name none, as on a full disk."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno is not None and error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 @contextmanager
@@ -187,13 +198,14 @@ class Lock:
                 logger.warning("%s: this file system has no locks, others are not kept out", path)
                 break
             self._file.close()
-        self._file.truncate(0)
         try:
-            name = f"process {os.getpid()} on {socket.gethostname()}"
-            os.write(self._file.fileno(), name.encode())
-        except OSError as error:
+            with naming(path):
+                self._file.truncate(0)
+                name = f"process {os.getpid()} on {socket.gethostname()}"
+                os.write(self._file.fileno(), name.encode())
+        except OSError:
             self.release()
-            raise OSError(error.errno, error.strerror, str(path)) from error
+            raise
 
     def release(self) -> None:
         """Unlock and delete the file; further calls have no effect."""
@@ -263,7 +275,8 @@ def write_state(folder: str | Path, state: Mapping[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     tensors: dict[str, torch.Tensor] = {}
     values = _encoded(state, tensors)
-    (folder / _VALUES_FILE).write_text(json.dumps(values) + "\n", encoding="utf-8")
+    with naming(folder):
+        (folder / _VALUES_FILE).write_text(json.dumps(values) + "\n", encoding="utf-8")
     write_tensors(folder / _TENSORS_FILE, tensors)
 
 

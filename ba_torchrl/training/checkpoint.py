@@ -41,6 +41,7 @@ from ba_torchrl.core.files import (
     check,
     complete_only,
     lock_holder,
+    naming,
     read_json,
     read_state,
     remove_scratch,
@@ -210,7 +211,7 @@ class DurableCheckpoint(Checkpoint):
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write a checkpoint; see TorchRL."""
         path = Path(path)
-        with complete_only(path, replace=True) as scratch:
+        with naming(path), complete_only(path, replace=True) as scratch:
             super().save(scratch, **options)
             seal(scratch)
         return path
@@ -436,7 +437,7 @@ class ResumeState:
 
     def remove(self) -> None:
         """Delete the state of a finished run."""
-        shutil.rmtree(self._folder, ignore_errors=True)
+        shutil.rmtree(self._folder.resolve(), ignore_errors=True)  # it may be a link
 
 
 def resumable_updates(folder: str | Path) -> int | None:

@@ -334,5 +334,7 @@ def test_a_text_file_is_whole_or_not_there(tmp_path, monkeypatch):
     monkeypatch.setattr(files.os, "fsync", lambda _: (_ for _ in ()).throw(OSError("full")))
     with pytest.raises(OSError, match="full"):
         write_text(path, "x" * 100)
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
+        write_text("/dev/full", "x")
     assert json.loads(path.read_text()) == {}
     assert list(tmp_path.iterdir()) == [path]

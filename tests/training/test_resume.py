@@ -103,6 +103,9 @@ def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path):
     with pytest.raises(Interrupted):
         experiment.run()
     assert kept == [1, 2, 3]
+    state, disk = config.folder / "resume", tmp_path / "larger disk"
+    state.rename(disk)
+    state.symlink_to(disk)
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
     experiment.algorithm.update = None
     assert experiment.run().updates == 9
@@ -110,6 +113,7 @@ def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path):
     assert [point.updates for point in result.curve] == [0, 3, 6, 9]
     assert result.resumed_at == [9]
     assert len(saved_steps(rotation.directory)) == 2
+    assert not disk.exists()
 
 
 def test_a_run_interrupted_before_its_first_state_starts_again(tmp_path, caplog, monkeypatch):
