@@ -77,7 +77,7 @@ def import_modules(names: Iterable[str]) -> None:
             its import, which is the cause.
     """
     for name in names:
-        if not (isinstance(name, str) and all(map(str.isidentifier, name.split(".")))):
+        if not _is_module_name(name):
             raise ConfigError(f"plugins: {name!r} is not the name of a module, such as my.tasks")
         try:
             importlib.import_module(name)
@@ -93,6 +93,10 @@ def import_modules(names: Iterable[str]) -> None:
                 + " from the folder that holds it, put that folder on PYTHONPATH, or install the "
                 "package"
             ) from None
+
+
+def _is_module_name(name: object) -> bool:
+    return isinstance(name, str) and all(map(str.isidentifier, name.split(".")))
 
 
 def _summary(error: BaseException) -> str:
@@ -120,11 +124,13 @@ def check_known(names: object, file: str | Path) -> None:
     installed = {point.module for point in entry_points(group=GROUP)}
     listed = map(str, names) if isinstance(names, list) else ()
     unknown = [name for name in listed if name not in sys.modules and name not in installed]
+    if wrong := [name for name in unknown if not _is_module_name(name)]:
+        raise ConfigError(f"{file}: plugins: {wrong[0]!r} is not the name of a module")
     if unknown:
-        listed = ",".join(unknown)
+        text = ",".join(unknown)
         raise ConfigError(
-            f"{file} uses the plugins [{listed}]: modules outside this package, whose import runs "
-            f"their code. If you trust them, add 'plugins=[{listed}]', or import them first"
+            f"{file} uses the plugins [{text}]: modules outside this package, whose import runs "
+            f"their code. If you trust them, add 'plugins=[{text}]', or import them first"
         )
 
 

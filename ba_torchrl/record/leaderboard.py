@@ -90,10 +90,7 @@ def leaderboard(
 def _unfit(result: RunResult, tasks: Sequence[str], protocol: int) -> list[str]:
     """Return why a run does not belong to the table."""
     if result.task not in tasks:
-        names = result.config.get("plugins")
-        named = ",".join(map(str, names)) if isinstance(names, list) else ""
-        way_out = f"if you trust them, add 'plugins=[{named}]'" if named else "name its plugins"
-        return [f"its task is not registered; {way_out}"]
+        return ["its task is not registered; name its plugins"]
     task = TASKS[result.task]
     numbers = [
         ("task version", result.task_version, task.version),

@@ -17,6 +17,7 @@ from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
 from ba_torchrl.core.files import replaced
+from ba_torchrl.record.summary import printable
 
 # Distinguishable by colour-blind readers (Okabe and Ito), in order of decreasing contrast.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
@@ -74,7 +75,7 @@ def plot_panels(
     """
     columns = min(columns, min((4, 3), key=lambda n: -len(panels) % n), len(panels))
     rows = math.ceil(len(panels) / columns)
-    labels = {name: textwrap.wrap(name, _LABEL_WIDTH) for name in names}
+    labels = {name: textwrap.wrap(printable(name), _LABEL_WIDTH) for name in names}
     gap_in = 1.3 * _LABEL_PT / 72 * max(map(len, labels.values()), default=1)
     height_in = max(panel_in[1], gap_in * max(map(len, panels.values())))
     longest = max((len(line) for lines in labels.values() for line in lines), default=0)
@@ -89,7 +90,7 @@ def plot_panels(
             label = "\n".join(labels[name])
             ends += [(x, y, line, label) for x, y in line.get_xydata()[-1:]]
         _label(axes, ends, gap_in / height_in)
-        axes.set_title(title, fontsize=10)
+        axes.set_title(printable(title), fontsize=10)
         before = max((method.demonstration_steps for method in curves.values()), default=0)
         axes.set_xlim(left=-1.05 * before)
         if before:

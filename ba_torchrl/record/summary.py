@@ -455,11 +455,12 @@ def pipes(header: Sequence[str], *rows: Sequence[str]) -> list[str]:
 
 def markdown(text: str) -> str:
     """Return a text as one line of Markdown that makes no HTML, no link and no cell of a table."""
-    return re.sub(r"[\\|<]|\](?=[(\[])", r"\\\g<0>", "".join(map(_printed, text)))
+    return re.sub(r"[\\|<]|\](?=[(\[])", r"\\\g<0>", printable(text))
 
 
-def _printed(character: str) -> str:
-    return character if character.isprintable() or character == "\N{NO-BREAK SPACE}" else " "
+def printable(text: str) -> str:
+    """Return a text as one line, with spaces in place of characters that cannot be printed."""
+    return "".join(c if c.isprintable() or c == "\N{NO-BREAK SPACE}" else " " for c in text)
 
 
 def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:

@@ -67,10 +67,6 @@ def test_all_runs_of_other_versions_are_left_out_and_named(tmp_path):
         "expert version 9 instead of 0": {"expert_version": 9},
         "100 test episodes, fewer than 200": {"last": policy_test(0.9, episodes=100)},
         "its task is not registered; name its plugins": {"task": "mine/push"},
-        "its task is not registered; if you trust them, add 'plugins=[mine,yours]'": {
-            "task": "mine/pull",
-            "config": {"plugins": ["mine", "yours"]},
-        },
     }
     runs = [make_run(tmp_path / str(n), **each) for n, each in enumerate(others.values())]
     runs += [make_run(tmp_path / "none", expert_version=None)]

@@ -6,6 +6,7 @@ import shutil
 import subprocess
 from html.parser import HTMLParser
 from pathlib import Path
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -378,18 +379,24 @@ def test_a_run_of_somebody_else_imports_and_copies_nothing_from_outside_its_fold
     files = {"video": "film.mp4"}
     write_run(Path("runs/a"), (0.1, 0.6), config=config, files=files, benchmark=None)
     write_run(Path("runs/b"), (0.1, 0.6), config=config, files=files, benchmark=None, seed=1)
+    pasted = "x]'; rm -rf /; '"
+    write_run(Path("runs/c"), (0.1,), config={"plugins": [pasted]}, label="\x00\x1b[31m", final=0.5)
     Path("runs/a/film.mp4").symlink_to("../../secret.mp4")
     Path("runs/b/own.mp4").write_text("own")
     Path("runs/b/film.mp4").symlink_to("own.mp4")
     for module in (report, leaderboard):
         caplog.clear()
         module.COMMAND.run(["runs"])
-        (warning,) = caplog.messages
+        warning, other = caplog.messages
         assert "uses the plugins [evil]" in warning
         assert "If you trust them, add 'plugins=[evil]'" in warning
+        assert repr(pasted) in other
+        assert "add " not in other
     assert not Path("CODE_RAN").exists()
     films = {path.name: path.read_text() for path in Path("runs/report").rglob("*.mp4")}
     assert films == {"close_loop_block_reaching_sacfd_equi_seed1.mp4": "own"}
+    for file in Path("runs/report").rglob("*.svg"):
+        ElementTree.parse(file)
 
 
 def test_the_texts_of_a_run_are_texts_in_every_file(tmp_path):
