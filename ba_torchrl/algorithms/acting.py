@@ -10,8 +10,10 @@ from tensordict.nn import TensorDictModuleBase
 from torch import nn
 from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
+from typing_extensions import Self
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.modules.steerable.layers import reuse_filters
 
 
@@ -25,7 +27,8 @@ def constant_weights() -> Iterator[None]:
 class ActingPolicy(TensorDictModuleBase):
     """A policy on an environment's observations, which are transformed as in training.
 
-    It writes ``action`` and nothing else.
+    It writes ``action`` and nothing else. It is in evaluation mode, also after ``train()``, and
+    shares the parameters and buffers of the given policy, whose mode does not change.
 
     Args:
         policy: from the transformed observation to ``action``.
@@ -41,11 +44,16 @@ class ActingPolicy(TensorDictModuleBase):
         exploration: TensorDictModuleBase | None = None,
     ) -> None:
         super().__init__()
-        self.policy = policy
+        self.policy = evaluation_copy(policy)
         self.transforms = nn.ModuleList(transforms)
         self.exploration = exploration
         self.in_keys = list(policy.in_keys)
         self.out_keys = [keys.ACTION]
+        self.eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Stay in evaluation mode."""
+        return super().train(False)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of a root TensorDict of any batch shape."""

@@ -36,6 +36,7 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
+from ba_torchrl.objectives.networks import with_buffers
 
 __all__ = [
     "ALGORITHMS",
@@ -100,7 +101,8 @@ class Learner(ABC):
         ).to(problem.device)
         self.stages = self.make_stages()
         self.first_losses = self.make_first_losses()
-        self.target_updater = self.make_target_updater()
+        updater = self.make_target_updater()
+        self.target_updater = None if updater is None else with_buffers(updater)
         self.replay = self.make_replay()
         for transform in self.make_transforms():
             self.replay.append_transform(transform)

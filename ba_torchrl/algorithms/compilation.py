@@ -75,8 +75,11 @@ class CompiledLoss:
         if not self._is_compiled:
             self._is_compiled = True
             device = next(self.loss.parameters()).device
+            buffers = [(buffer, buffer.clone()) for buffer in self.loss.buffers()]
             with torch.random.fork_rng([device] if device.type == "cuda" else []):
                 self.function(batch.copy())
+            for buffer, before in buffers:  # such as the statistics of a batch norm
+                buffer.copy_(before)
             if self.function is self.loss:
                 self.loss.compile(mode=self.mode, dynamic=False)
             else:

@@ -204,7 +204,7 @@ class DAgger(BC):
     def __init__(self, config: DAggerConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)
         seed = problem.derived_seed(SeedUse.MIXTURE)
-        self.policy = MixedPolicy(self.policy, self.actions, seed).to(problem.device)
+        self.policy = MixedPolicy(self.policy, self.actions, seed).to(problem.device).eval()
         self._set_beta()
 
     def update(self) -> TensorDict:

@@ -15,7 +15,7 @@ from pydantic import Field
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor
-from torchrl.objectives import IQLLoss, SoftUpdate
+from torchrl.objectives import SoftUpdate
 
 from ba_torchrl.algorithms.base import (
     ALGORITHMS,
@@ -32,6 +32,7 @@ from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.gaussian_policy import truncated_gaussian_policy
 from ba_torchrl.modules.base import NetworkConfig
+from ba_torchrl.objectives.iql import ModalIQLLoss
 
 
 @ALGORITHMS.register("iql")
@@ -88,7 +89,7 @@ class IQL(Learner):
     """A truncated Gaussian policy, two critics and a state value."""
 
     config: IQLConfig
-    loss: IQLLoss
+    loss: ModalIQLLoss
 
     def make_networks(self, network: NetworkConfig) -> IQLNetworks:
         """Return actor, critics and state value."""
@@ -108,11 +109,11 @@ class IQL(Learner):
             networks.actor, self.observation_keys, std_min=self.config.std_min
         )
 
-    def make_loss(self, networks: IQLNetworks) -> IQLLoss:
+    def make_loss(self, networks: IQLNetworks) -> ModalIQLLoss:
         """Return TorchRL's loss without ``vmap``, under which the CPU's compiled convolutions and
         pools are not available."""
         inputs = [*self.observation_keys, keys.ACTION]
-        loss = IQLLoss(
+        loss = ModalIQLLoss(
             self.make_policy(networks),
             [TensorDictModule(q, inputs, ["state_action_value"]) for q in networks.qvalues],
             TensorDictModule(networks.value, self.observation_keys, ["state_value"]),

@@ -1,5 +1,6 @@
 """Networks and policies. They depend on image and action shapes, not on tasks."""
 
+from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.equivariant import EquivariantConfig, StridedEquivariantConfig
@@ -50,6 +51,7 @@ __all__ = [
     "SteerableConv2d",
     "SteerableLinear",
     "StridedEquivariantConfig",
+    "evaluation_copy",
     "spatial_policy",
     "squashed_gaussian_policy",
     "truncated_gaussian_policy",

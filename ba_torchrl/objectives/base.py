@@ -11,12 +11,13 @@ import torch
 from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
-from torchrl.objectives import LossModule, ValueEstimators
+from torchrl.objectives import ValueEstimators
 from torchrl.objectives.utils import dispatch_value_estimator
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
+from ba_torchrl.objectives.networks import ModalLoss
 
 Reduction = Literal["none", "mean", "sum"]
 """How the losses of a batch's samples are combined, as in TorchRL."""
@@ -27,7 +28,7 @@ WeightNorm = Literal["max", "mean"]
 """Normalisation of a batch's importance weights, see `TransitionLoss`."""
 
 
-class TransitionLoss(LossModule):
+class TransitionLoss(ModalLoss):
     """A loss with one-step targets, reduced over a batch by TorchRL's rules.
 
     Samples that a mask excludes (TorchRL's ``loss_mask_key``) do not count.

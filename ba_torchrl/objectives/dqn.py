@@ -210,9 +210,10 @@ class LevelDQNLoss(TransitionLoss):
         """
         self._set_batch_size(tensordict, 1)
         target = self._target(tensordict)
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            levels = self.value_network(
-                *(tensordict[key] for key in self.value_network.in_keys),
+        network = self.network("value_network")
+        with self.value_network_params.to_module(network, preserve_module_state=False):
+            levels = network(
+                *(tensordict[key] for key in network.in_keys),
                 tensordict[self.tensor_keys.action],
             )
         q = torch.stack([values.gather(1, chosen[:, None]) for values, chosen in levels], dim=-1)
@@ -246,10 +247,9 @@ class LevelDQNLoss(TransitionLoss):
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Return y [B, 1]."""
         following = tensordict[keys.NEXT]
-        params = self.target_value_network_params
-        with params.to_module(self.value_network, preserve_module_state=False):
-            observation = (following[key] for key in self.value_network.in_keys)
-            _, value = self.value_network.greedy(*observation)
+        params, network = self.target_value_network_params, self.network("value_network")
+        with params.to_module(network, preserve_module_state=False):
+            _, value = network.greedy(*(following[key] for key in network.in_keys))
         return self.value_estimator.value_estimate(tensordict, next_value=value)
 
     def _demonstration_losses(

@@ -11,16 +11,16 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from tensordict.utils import NestedKey
 from torch import nn
-from torchrl.objectives import LossModule
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.distance import ActionDistance, action_distance
 from ba_torchrl.objectives.dqn import LevelValues
+from ba_torchrl.objectives.networks import ModalLoss
 
 
-class _ImitationLoss(LossModule):
+class _ImitationLoss(ModalLoss):
     """A loss on observations and the actions to imitate, a mean over the samples of a batch that no
     mask excludes (TorchRL's ``loss_mask_key``)."""
 
@@ -85,9 +85,9 @@ class BehaviourCloningLoss(_ImitationLoss):
             tensordict: observations and expert actions [B]. The observation's entries may have a
                 dimension of views after the batch.
         """
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            observation = tensordict.select(*self.actor_network.in_keys)
-            distribution = self.actor_network.get_dist(observation)
+        actor = self.network("actor_network")
+        with self.actor_network_params.to_module(actor, preserve_module_state=False):
+            distribution = actor.get_dist(tensordict.select(*actor.in_keys))
             if self.entropy_weight:
                 sample, log_prob = compute_rsample_log_prob(distribution)
             else:
@@ -130,8 +130,9 @@ class LevelCrossEntropyLoss(_ImitationLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc`` of observations and expert actions [B], and the fraction of choices
         that are the expert's as ``accuracy``."""
-        with self.value_network_params.to_module(self.value_network, preserve_module_state=False):
-            levels = self.value_network(*(tensordict[key] for key in self.in_keys))
+        network = self.network("value_network")
+        with self.value_network_params.to_module(network, preserve_module_state=False):
+            levels = network(*(tensordict[key] for key in self.in_keys))
         losses = [F.cross_entropy(*level, reduction="none") for level in levels]
         hits = [(values.argmax(dim=1) == chosen).float() for values, chosen in levels]
         losses, hits = (

@@ -315,14 +315,16 @@ class SACfDLoss(TransitionLoss):
 
     def _sample_action(self, tensordict: TensorDictBase) -> tuple[Tensor, Tensor]:
         """Return an action [..., A] drawn with gradient and its log-probability [...]."""
-        with self.actor_network_params.to_module(self.actor_network, preserve_module_state=False):
-            observation = tensordict.select(*self.actor_network.in_keys)
-            return compute_rsample_log_prob(self.actor_network.get_dist(observation))
+        actor = self.network("actor_network")
+        with self.actor_network_params.to_module(actor, preserve_module_state=False):
+            observation = tensordict.select(*actor.in_keys)
+            return compute_rsample_log_prob(actor.get_dist(observation))
 
     def _features(self, tensordict: TensorDictBase, params: TensorDictBase) -> Tensor:
-        with params.to_module(self.encoder_network, preserve_module_state=False):
-            observation = tensordict.select(*self.encoder_network.in_keys)
-            return self.encoder_network(observation)[self.encoder_network.out_keys[0]]
+        encoder = self.network("encoder_network")
+        with params.to_module(encoder, preserve_module_state=False):
+            observation = tensordict.select(*encoder.in_keys)
+            return encoder(observation)[encoder.out_keys[0]]
 
     def _values(self, features: Tensor, action: Tensor, params: TensorDictBase) -> Tensor:
         """Return the values [..., K] of an action at given features."""
@@ -330,8 +332,9 @@ class SACfDLoss(TransitionLoss):
             {self.encoder_network.out_keys[0]: features, self.tensor_keys.action: action},
             batch_size=action.shape[:-1],
         )
-        with params.to_module(self.qvalue_network, preserve_module_state=False):
-            return self.qvalue_network(inputs)[self.tensor_keys.state_action_value]
+        critic = self.network("qvalue_network")
+        with params.to_module(critic, preserve_module_state=False):
+            return critic(inputs)[self.tensor_keys.state_action_value]
 
     def _observation(self, tensordict: TensorDictBase, views: int) -> TensorDictBase:
         """Return the observation [..., B], or [..., B, views] if it has several views."""

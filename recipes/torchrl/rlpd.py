@@ -24,6 +24,7 @@ from ba_torchrl.modules import (
     ActionValue,
     ActorCriticSpec,
     EquivariantConfig,
+    evaluation_copy,
     squashed_gaussian_policy,
 )
 
@@ -88,7 +89,7 @@ def main(
     )
     collector = Collector(
         make(seed=seed),
-        policy,
+        evaluation_copy(policy),  # with the same parameters
         frames_per_batch=num_envs,
         total_frames=num_envs * steps,
         auto_register_policy_transforms=False,

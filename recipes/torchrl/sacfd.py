@@ -24,8 +24,13 @@ import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.data import ImageCodecs, SO2Augmentation, as_transitions, make_codecs, make_replay
 from ba_torchrl.demonstrations import collect_demonstrations
-from ba_torchrl.modules import ActorCriticSpec, EquivariantConfig, squashed_gaussian_policy
-from ba_torchrl.objectives import SACfDLoss
+from ba_torchrl.modules import (
+    ActorCriticSpec,
+    EquivariantConfig,
+    evaluation_copy,
+    squashed_gaussian_policy,
+)
+from ba_torchrl.objectives import SACfDLoss, with_buffers
 
 
 def main(
@@ -69,7 +74,7 @@ def main(
 
     collector = Collector(
         TransformedEnv(make(seed=seed), ImageCodecs(images)),
-        policy,
+        evaluation_copy(policy),  # with the same parameters
         frames_per_batch=num_envs,
         total_frames=num_envs * updates,
         postproc=partial(as_transitions, images=images, is_demonstration=False),
@@ -82,7 +87,7 @@ def main(
         optim_steps_per_batch=1,
         loss_module=loss,
         optimizer=torch.optim.Adam(loss.parameters(), lr=3e-4),
-        target_net_updater=SoftUpdate(loss, tau=0.05),
+        target_net_updater=with_buffers(SoftUpdate(loss, tau=0.05)),
         replay_buffer=replay,
         log_rewards=False,  # would need TorchRL's RewardSum(out_keys=["reward_sum"])
         checkpoint=None if checkpoint is None else Checkpoint(),

@@ -24,9 +24,10 @@ from ba_torchrl.modules import (
     SpatialPolicy,
     SpatialSpec,
     SpatialValues,
+    evaluation_copy,
     spatial_policy,
 )
-from ba_torchrl.objectives import LevelDQNLoss
+from ba_torchrl.objectives import LevelDQNLoss, with_buffers
 
 
 def main(
@@ -65,7 +66,8 @@ def main(
     loss = LevelDQNLoss(values, demonstrations="sdqfd", demonstration_weight=0.1, margin=0.1)
     loss.make_value_estimator(gamma=0.9)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4, weight_decay=1e-5)
-    target_updater = HardUpdate(loss, value_network_update_interval=24)  # every 25th update
+    # copies at every 25th update
+    target_updater = with_buffers(HardUpdate(loss, value_network_update_interval=24))
 
     replay = make_replay("symmetric", 100_000, batch_size, codecs=make_codecs(images), seed=seed)
     for episode in collect_demonstrations(
@@ -95,7 +97,7 @@ def main(
     )
     collector = Collector(
         TransformedEnv(make(seed=seed), ImageCodecs(images)),
-        policy,
+        evaluation_copy(policy),  # with the same parameters
         frames_per_batch=num_envs,
         total_frames=num_envs * (updates - pretrain_updates),
         auto_register_policy_transforms=False,

@@ -162,7 +162,10 @@ def test_updates_leave_the_modes_and_are_compiled_once():
 def test_results_are_copies_and_priorities_are_written():
     learner = build("sac", "cnn", **SACFD)
     loss = CompiledLoss(learner.loss, "default")
+    handle = learner.loss.register_forward_pre_hook(lambda module, _: module.target_entropy.sub_(1))
     loss(learner.sample())
+    assert float(learner.loss.target_entropy) == -6.0  # the pass before compilation is undone
+    handle.remove()
     batch = learner.sample()
     batch[keys.TD_ERROR] = torch.zeros(8, 1)  # overwritten
     returned = {}

@@ -216,7 +216,8 @@ def test_renamed_keys():
     other = data.clone()
     for old, new in renames.items():
         other.rename_key_(old, new)
-    renamed.qvalue_network.in_keys[1] = "act"
+    for critic in (renamed.qvalue_network, renamed.evaluated_qvalue_network):
+        critic.in_keys[1] = "act"
     renamed.set_keys(
         action="act",
         is_demonstration=("meta", "demo"),

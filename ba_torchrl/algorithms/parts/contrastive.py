@@ -10,6 +10,7 @@ from pydantic import Field
 from torch import nn
 
 from ba_torchrl.core.config import Part
+from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.objectives.sacfd import BilinearInfoNCE
 
@@ -45,7 +46,7 @@ class InfoNCE(Part):
         device = next(encoder.parameters()).device
         zeros = [torch.zeros(image.shape, device=device) for image in images.values()]
         with torch.no_grad():  # without vectors, which are not compared
-            features = encoder(*zeros, torch.zeros(1, device=device))
+            features = evaluation_copy(encoder)(*zeros, torch.zeros(1, device=device))
         return BilinearInfoNCE(features.shape[-1])
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+import torch
 from pydantic import Field
 from torch import nn
 from torch.optim import Adam, Optimizer
@@ -11,6 +12,31 @@ from torch.optim.lr_scheduler import LinearLR
 from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ba_torchrl.core.config import StrictModel
+
+
+class PolicyAverage(AveragedModel):
+    """The exponential moving average of a policy's parameters and floating-point buffers.
+
+    Args:
+        policy: of which it begins as a copy.
+        decay: of the average, at each update.
+    """
+
+    def __init__(self, policy: nn.Module, decay: float) -> None:
+        super().__init__(policy, multi_avg_fn=get_ema_multi_avg_fn(decay))
+        self.decay = decay
+
+    @torch.no_grad()
+    def update_parameters(self, model: nn.Module) -> None:
+        """Move the average towards a policy of the same structure; the first update copies it."""
+        averages = [(each, each.clone()) for each in self.module.buffers()]
+        is_first = bool(self.n_averaged == 0)
+        super().update_parameters(model)  # which copies buffers
+        for buffer, before in averages:
+            if buffer.is_floating_point() and not is_first:
+                # an equal element stays, since the average of infinities is not a number
+                moved = torch.lerp(before, buffer, 1 - self.decay)
+                buffer.copy_(torch.where(before == buffer, buffer, moved))
 
 
 class OptimizerConfig(StrictModel):
@@ -27,8 +53,8 @@ class OptimizerConfig(StrictModel):
     """Bound of each element of the networks' gradient; None for no bound, as in the reference
     implementation's SAC."""
     policy_average: float = Field(default=0.0, ge=0, lt=1)
-    """Decay of the exponential moving average of the policy's parameters with which the policy
-    acts; 0 for acting with the last parameters. None in the appendix."""
+    """Decay of the exponential moving average of the policy's parameters and statistics with which
+    the policy acts; 0 for acting with the last ones. None in the appendix."""
 
     def adam(
         self, parameters: Iterable[nn.Parameter], networks: Iterable[nn.Parameter], factor: float
@@ -54,8 +80,8 @@ class OptimizerConfig(StrictModel):
         end = self.learning_rate_end_factor
         return LinearLR(optimizer, start_factor=1.0, end_factor=end, total_iters=steps)
 
-    def average(self, policy: nn.Module) -> AveragedModel | None:
+    def average(self, policy: nn.Module) -> PolicyAverage | None:
         """Return the moving average of a policy, if configured."""
         if not self.policy_average:
             return None
-        return AveragedModel(policy, multi_avg_fn=get_ema_multi_avg_fn(self.policy_average))
+        return PolicyAverage(policy, self.policy_average)

@@ -1,0 +1,32 @@
+"""The one place that decides in which mode networks with dropout or batch norm compute.
+
+A network that a loss trains is in training mode. A policy that acts, and whatever a loss computes
+without gradients, such as targets, is a copy of it in evaluation mode.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import TypeVar
+
+from torch import nn
+
+Network = TypeVar("Network", bound=nn.Module)
+
+
+def evaluation_copy(network: Network) -> Network:
+    """Return a copy of a network in evaluation mode, with the same parameters and buffers.
+
+    The copy computes with the latest parameters and statistics and changes neither, in whichever
+    mode the network is. Only modules are copied, not tensors.
+
+    Examples:
+        >>> import torch
+        >>> from ba_torchrl.modules import evaluation_copy
+        >>> network = torch.nn.Sequential(torch.nn.Linear(2, 2), torch.nn.Dropout(0.5))
+        >>> acting = evaluation_copy(network)
+        >>> acting.training, network.training, acting[0].weight is network[0].weight
+        (False, True, True)
+    """
+    shared = {id(tensor): tensor for tensor in (*network.parameters(), *network.buffers())}
+    return copy.deepcopy(network, shared).eval()
