@@ -38,6 +38,8 @@ class ImageSpec:
         channel_axes: for "gripper" images, the gripper's axes along rows and columns of each
             channel; empty for "xy" in every channel.
         dtype: of the values.
+        max_zeros: largest share of values of 0 that the environment draws. More of them are pixels
+            without a return of a real camera.
     """
 
     channels: int
@@ -48,6 +50,7 @@ class ImageSpec:
     frame: Frame = "scene"
     channel_axes: tuple[str, ...] = ()
     dtype: torch.dtype = torch.float32
+    max_zeros: float = 1.0
 
     def __post_init__(self) -> None:
         check_choice("storage", self.storage, Storage)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +27,8 @@ from ba_torchrl.demonstrations.formats.base import (
     plain,
     read_file,
 )
+from ba_torchrl.demonstrations.plausibility import contradictions
+from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import ResolvedEnv
 
@@ -122,7 +125,9 @@ class MappedFile:
     ) -> None:
         self._form, self._path, self._resolved = form, path, resolved
         self._sources = _sources(mapping)
-        self._specs = entry_specs(resolved)
+        with opened(resolved) as env:
+            self._specs = _specs_of(env)
+            self._vectors, self._images = env.declared, env.images
         self._is_sparse = resolved.config.reward == "sparse"
         known = {*self._specs, *RESULTS, keys.INSTRUCTION}
         if unknown := self._sources.keys() - known:
@@ -146,6 +151,9 @@ class MappedFile:
         if not episodes:
             raise ConfigError(f"{self._path} holds no episodes")
         self._warn_of_constants(episodes)
+        self._warn_of_zeros(episodes)
+        for message in contradictions(episodes, self._resolved):
+            logger.warning("%s: %s", self._path, message)
         if keys.REWARD in self._sources and keys.SUCCESS not in self._sources:
             if not any(arrays[keys.REWARD].any() for arrays in episodes):
                 logger.warning(
@@ -195,6 +203,8 @@ class MappedFile:
                 values = source.values(np.asarray(found))
                 if key in self._specs:
                     values = _fitted(values, self._specs[key])
+                    if key in self._vectors:
+                        values = self._vectors[key].fitted(values)
                 elif key in RESULTS:
                     values = _one_number(values)
                     if key != keys.REWARD or self._is_sparse:
@@ -225,19 +235,48 @@ class MappedFile:
                     "%s: %s is %g in all steps; is it the right entry?", self._path, key, first
                 )
 
+    def _warn_of_zeros(self, episodes: Sequence[Arrays]) -> None:
+        """Warn of more zeros than the environment's images have, and of points at the origin."""
+        for key in self._specs:
+            most = self._images[key].max_zeros if key in self._images else 1.0
+            zeros = [arrays[key] == 0 for arrays in episodes]
+            if key == keys.POINT_CLOUD:
+                most, zeros = 0.0, [each.all(-1) for each in zeros]
+            share = sum(each.sum() for each in zeros) / sum(each.size for each in zeros)
+            if share > most:
+                logger.warning(
+                    "%s: %.0f %% of %s is 0 m, as where a camera has no return; the environment "
+                    "has at most %.0f %%. Fill in these values",
+                    self._path,
+                    100 * share,
+                    key,
+                    100 * most,
+                )
+
 
 def entry_specs(resolved: ResolvedEnv) -> dict[str, TensorSpec]:
     """Return the specifications of an environment's observations and actions, by key."""
-    made = make(resolved)
+    with opened(resolved) as env:
+        return _specs_of(env)
+
+
+@contextmanager
+def opened(resolved: ResolvedEnv) -> Iterator[BulletArmEnv]:
+    """Make an environment, and close it."""
+    env = make(resolved)
     try:
-        specs = {
-            key: spec
-            for key, spec in made.observation_spec.items()
-            if key not in _NOT_OBSERVED and not isinstance(spec, NonTensor)
-        }
-        return {**specs, keys.ACTION: made.action_spec}
+        yield env
     finally:
-        made.close()
+        env.close()
+
+
+def _specs_of(env: BulletArmEnv) -> dict[str, TensorSpec]:
+    specs = {
+        key: spec
+        for key, spec in env.observation_spec.items()
+        if key not in _NOT_OBSERVED and not isinstance(spec, NonTensor)
+    }
+    return {**specs, keys.ACTION: env.action_spec}
 
 
 def _num_steps(episodes: Sequence[Arrays]) -> int:

@@ -402,6 +402,8 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
             if len(spec.shape) == 1 and spec.dtype.is_floating_point
         }
         """Length of each vector of floats that is observed, by key."""
+        self.declared = merge_entries([extra.vectors(largest) for extra in self._observations])
+        """Declaration of each vector and of points, by key."""
         self.observation_spec = Composite(merge_entries([seen, extras, general]), device="cpu")
         self.action_spec = action
         # unbounded, since TorchRL's transforms of rewards take no other specification

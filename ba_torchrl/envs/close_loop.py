@@ -23,6 +23,8 @@ from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.workspace import ActionLimits
 
 START_HEIGHT_M = 0.2
+FINGERS_SHARE = 0.1
+"""More than the share of the fingers, squares of zero, in an image of the default scale."""
 HALF_TURN = (-math.pi / 2, math.pi / 2)
 """Range of the yaw with `half_rotation`; episodes start at its centre."""
 
@@ -80,7 +82,11 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
         low, high = self._view.range_m(self._view_setup)
         channels, size = self._view.channels, self.config.obs_size
         frame: Frame = "scene" if self._view.rotates_with_scene else "camera"
-        return {keys.DEPTH: ImageSpec(channels, size, high, low, storage="uint8", frame=frame)}
+        is_depth = not getattr(self._view, "shows_height", True)  # with zeros at the fingers only
+        scale = max(1.0, EnvConfig.model_fields["view_scale"].default / self.config.view_scale)
+        zeros = min(1.0, FINGERS_SHARE * scale**2) if is_depth else 1.0
+        image = ImageSpec(channels, size, high, low, "uint8", frame, max_zeros=zeros)
+        return {keys.DEPTH: image}
 
     def _place_robot(self, scene: Scene) -> None:
         x, y = self.workspace.center

@@ -13,13 +13,14 @@ import numpy as np
 import torch
 from tensordict import NonTensorData
 from torch import Tensor
-from torchrl.data import Bounded, NonTensor, TensorSpec, Unbounded
+from torchrl.data import Bounded, NonTensor, TensorSpec
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
+from ba_torchrl.core.vectors import VectorSpec
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.vision.camera_views import finger_boxes
 from ba_torchrl.sim.vision.depth import point_cloud
@@ -29,6 +30,13 @@ from ba_torchrl.tasks.workspace import Workspace
 
 WRIST_RANGE_M = (0.02, 2.0)
 """Near and far plane of the wrist camera."""
+_REACH_M = 2.0
+"""No arm's gripper is farther from its base."""
+_FAR = 100.0
+"""Larger than any position that is scaled by the workspace, those of removed objects included."""
+_MAX_TILT_RAD = math.pi / 8
+"""More than the tilt of a gripper between two actions, which point it down; in open loop it is
+tilted during actions only."""
 
 
 class Observation(ABC):
@@ -52,9 +60,13 @@ class Observation(ABC):
         """Return the declarations of its images, by key."""
         return {}
 
+    def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
+        """Return the declarations of its vectors and points, by key."""
+        return {}
+
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
         """Return the specifications of its entries other than images, by key."""
-        return {}
+        return {key: each.to_tensor_spec() for key, each in self.vectors(scene).items()}
 
     @abstractmethod
     def observe(self, scene: Scene) -> dict[str, Tensor | NonTensorData]:
@@ -114,10 +126,14 @@ class PoseVector(Observation):
         """Return whether ``obs_type="vec"``."""
         return config.obs_type == "vec"
 
-    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specification of the vector."""
-        length = len(vector_names(len(scene.task.landmarks)))
-        return {keys.OBSERVATION: Unbounded((length,), device="cpu", dtype=torch.float32)}
+    def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
+        """Return the declaration of the vector."""
+        names = vector_names(len(scene.task.landmarks))
+        kinds = [name.rpartition("_")[2] for name in names]
+        high = tuple({"opening": 1.0, "yaw": 2.0}.get(kind, _FAR) for kind in kinds)
+        low = tuple(-value for value in high)
+        unit = "positions scaled to [-1, 1] by the workspace, yaws over pi"
+        return {keys.OBSERVATION: VectorSpec(tuple(names), unit, low, high)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the vector, positions scaled to [-1, 1] by the workspace."""
@@ -164,10 +180,12 @@ class PointCloud(Observation):
 
     parameter = "point_cloud"
 
-    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specification of the points."""
-        shape = (self.config.point_cloud, 3)
-        return {keys.POINT_CLOUD: Unbounded(shape, device="cpu", dtype=torch.float32)}
+    def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
+        """Return the declaration of the points."""
+        box = (self.workspace.x, self.workspace.y, self.workspace.z)
+        low, high = (tuple(ends[i] + side for ends in box) for i, side in ((0, -1.0), (1, 1.0)))
+        points = VectorSpec(("x", "y", "z"), "metres", low, high, rows=self.config.point_cloud)
+        return {keys.POINT_CLOUD: points}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the points, metres."""
@@ -188,9 +206,17 @@ class Proprioception(Observation):
 
     uses_camera = False
 
-    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specification of the vector."""
-        return {keys.PROPRIO: Unbounded((8,), device="cpu", dtype=torch.float32)}
+    def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
+        """Return the declaration of the vector."""
+        pose = VectorSpec(
+            ("x", "y", "z", "qx", "qy", "qz", "qw", "opening"),
+            "metres, a unit quaternion, and 0 (closed) to 1 (open)",
+            (-_REACH_M,) * 3 + (-1.0,) * 4 + (0.0,),
+            (_REACH_M,) * 3 + (1.0,) * 4 + (1.0,),
+            quaternion=3,
+            max_tilt_rad=_MAX_TILT_RAD,
+        )
+        return {keys.PROPRIO: pose}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the vector.
@@ -211,10 +237,12 @@ class Joints(Observation):
 
     uses_camera = False
 
-    def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specification of the angles."""
-        shape = (len(scene.robot.arm_joints),)
-        return {keys.JOINTS: Unbounded(shape, device="cpu", dtype=torch.float32)}
+    def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
+        """Return the declaration of the angles."""
+        count = len(scene.robot.arm_joints)
+        names = tuple(f"joint {number}" for number in range(count))
+        turn = (2 * math.pi,) * count
+        return {keys.JOINTS: VectorSpec(names, "radians", tuple(-x for x in turn), turn)}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the measured angles, radians."""

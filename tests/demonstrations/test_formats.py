@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import re
 import shutil
 import sys
 import zipfile
@@ -32,6 +33,7 @@ from ba_torchrl.demonstrations.demo_files import check_demonstrations, read_demo
 from ba_torchrl.demonstrations.formats import base
 from ba_torchrl.demonstrations.formats.base import FORMATS, Format, read_card
 from ba_torchrl.demonstrations.mapping import with_results
+from ba_torchrl.demonstrations.plausibility import contradictions
 from ba_torchrl.envs.settings import resolve_env
 from tests.tasks.episodes import demonstrations
 from tests.training.test_limits import limited
@@ -331,6 +333,131 @@ def test_lerobot_folders_with_lost_files_or_numbers_are_refused_without_the_hub(
     monkeypatch.setattr("socket.socket.connect", lambda *_: pytest.exit("the network was used"))
     with pytest.raises(ConfigError, match=message):
         load_demonstrations(path, task=TASK, env=ENV)
+
+
+POSED = {**ENV, "observations": ["proprio", "joints"], "point_cloud": 4}
+
+
+def posed(path, **changes):
+    """Write two episodes in which a gripper follows its actions; changes are of their arrays."""
+    rng = np.random.default_rng(0)
+    with h5py.File(path, "w") as file:
+        for i in range(2):
+            action = rng.uniform(-1, 1, (6, 5)) * [1, 0.3, 0.3, 0.3, 0.9]
+            holding = np.array([0, 0, 0, 1, 1, 1, 1])[:, None]
+            action[:, 0] = np.where(holding[1:, 0], -1, 1)
+            moved = np.cumsum(np.r_[np.zeros((1, 5)), action], axis=0)
+            half = (moved[:, 4] * np.pi / 4 / 2)[:, None]
+            turn = np.c_[np.cos(half), np.sin(half), 0 * half, 0 * half]
+            turn *= np.where(turn[:, :1] < 0, -1, 1)
+            data = {
+                "depth": rng.uniform(0.1, 0.2, (7, 1, SIZE, SIZE)),
+                "holding": holding,
+                "proprio": np.c_[[0.45, 0, 0.1] + moved[:, 1:4] * 0.05, turn, 1 - holding],
+                "joints": rng.uniform(-2, 2, (7, 7)),
+                "point_cloud": rng.uniform(0.3, 0.4, (7, 4, 3)) * [1, 0, 1],
+                "action": action,
+            }
+            for name, rows in data.items():
+                change = changes.get(name, lambda given, _: given)
+                file[f"data/demo_{i}/{name}"] = change(rows, data)
+    return path
+
+
+def read_posed(path):
+    keys = ("depth", "holding", "proprio", "joints", "point_cloud", "action")
+    return load_demonstrations(path, task=TASK, env=POSED, mapping={key: key for key in keys})
+
+
+def times(*factors):
+    return lambda given, _: given * factors
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"proprio": lambda given, _: given[:, [0, 1, 2, 6, 3, 4, 5, 7]]},
+            r"proprio: .* tilted by up to .* w, x, y, z .* have \[4, 5, 6, 3\] in place of \[3, 4",
+        ),
+        (
+            {"proprio": lambda given, _: given[:, [0, 1, 2, 5, 6, 3, 4, 7]]},
+            "proprio: .* tilted by up to 180 degrees, .*; check the frame and the order",
+        ),
+        ({"proprio": times(1, 1, 1, 0.5, 0.5, 0.5, 0.5, 1)}, "lengths from 0.5 to 0.5, needed 1"),
+        ({"proprio": times(1e3, 1e3, 1e3, 1, 1, 1, 1, 1)}, r"proprio: x has .*-2 to 2 \(metres"),
+        (
+            {"proprio": times(1, 1, 1, 1, 1, 1, 1, 255)},
+            "opening has values from 0 to 255, needed 0",
+        ),
+        ({"joints": times(*[57.3] * 7)}, r"joints: joint \d has .* to 6.28319 \(radians\)"),
+        ({"point_cloud": times(1e3, 1e3, 1e3)}, r"point_cloud: x has .*needed .*\(metres\)"),
+    ],
+)
+def test_foreign_units_and_orders_are_refused_by_the_declaration(changes, message, tmp_path):
+    with pytest.raises(ConfigError, match=f"episode 0: .*{message}"):
+        read_posed(posed(tmp_path / "a.hdf5", **changes))
+
+
+def test_the_sign_of_foreign_quaternions_becomes_that_of_the_declaration(tmp_path, caplog):
+    wanted = read_posed(posed(tmp_path / "a.hdf5"))
+    negated = posed(tmp_path / "b.hdf5", proprio=times(1, 1, 1, -1, -1, -1, -1, 1))
+    assert_equal(read_posed(negated), wanted)
+    assert caplog.messages == []
+
+
+def with_zeros(share):
+    def change(given, _):
+        rows = round(share * SIZE)
+        return given * (np.arange(SIZE)[:, None] >= rows)
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        (
+            {"action": times(-1, 1, 1, 1, 1)},
+            "in 100% of the steps .* remains held, the action opens",
+        ),
+        (
+            {
+                "action": lambda given, data: np.c_[
+                    given[:, :1], data["proprio"][1:, :3], given[:, 4:]
+                ]
+            },
+            "explain 0% of the gripper's motion; are they absolute positions",
+        ),
+        ({"action": times(1, 1, 1, 1, -1)}, "explain 0% of the gripper's turns; check their sign"),
+        (
+            {"proprio": lambda given, _: np.c_[given[:, :3], given[:, [4, 3, 5, 6, 7]]]},
+            "explain 0% of the gripper's turns; .* the order x, y, z, w",
+        ),
+        ({"depth": with_zeros(0.3)}, "30 % of depth is 0 m, .* at most 10 %"),
+        ({"depth": with_zeros(0.05)}, None),
+        (
+            {"point_cloud": lambda given, _: given * (np.arange(4)[:, None] > 0)},
+            "25 % of point_cloud",
+        ),
+    ],
+)
+def test_contradictions_and_missing_returns_are_warnings(changes, message, tmp_path, caplog):
+    read_posed(posed(tmp_path / "a.hdf5", **changes))
+    assert bool(caplog.messages) == (message is not None)
+    assert message is None or re.search(message, caplog.messages[0])
+
+
+def test_actions_tell_of_themselves_and_of_what_is_held():
+    far = {"action": np.tile([1, 0.45, 0, 0.1, 0], (20, 1)), "holding": np.zeros((21, 1), bool)}
+    (message,) = contradictions([far, far], resolve_env(TASK, ENV))
+    assert "add up to more than the workspace; are the actions absolute positions?" in message
+    steps = np.arange(5)[:, None]
+    turns = {"action": np.c_[steps[:4] % 2 == 0, np.zeros((4, 3))], "holding": steps % 2 == 1}
+    stacking = resolve_env("open_loop/block_stacking", {})
+    (message,) = contradictions([turns], stacking)
+    assert "100% of the actions pick while an object is held, or place without one" in message
+    assert [*contradictions([{**turns, "holding": steps % 2 == 0}], stacking)] == []
 
 
 # Another robot's teleoperation: depth in millimetres with channels last, an action of
