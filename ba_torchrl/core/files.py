@@ -51,6 +51,8 @@ _SCRATCH = re.compile(r"\.\d+\.[0-9a-f]{6}\.")
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 """Of file systems of networks that are mounted without locks."""
 _UNNAMED = "another process"
+_ASKING_S = 0.05
+"""Time in which `lock_holder` has let go of a lock."""
 
 logger = logging.getLogger(__name__)
 
@@ -178,6 +180,7 @@ class Lock:
 
     def __init__(self, path: Path, what: str) -> None:
         self._path = path
+        waits = [_ASKING_S] * 3
         while True:
             self._file = path.open("a+")
             try:
@@ -187,10 +190,12 @@ class Lock:
             except FileNotFoundError:  # its holder has deleted it
                 pass
             except BlockingIOError:
-                self._file.seek(0)
-                holder = self._file.read() or _UNNAMED
-                self._file.close()
-                raise ConfigError(f"{holder} {what}") from None
+                if not waits:
+                    self._file.seek(0)
+                    holder = self._file.read() or _UNNAMED
+                    self._file.close()
+                    raise ConfigError(f"{holder} {what}") from None
+                time.sleep(waits.pop())
             except OSError as error:
                 if error.errno not in _NO_LOCKS:
                     self.release()

@@ -311,6 +311,15 @@ def test_a_lock_on_a_file_that_its_holder_deleted_is_none(tmp_path, monkeypatch)
     assert not list(tmp_path.iterdir())
 
 
+def test_a_process_that_asks_for_the_holder_keeps_nobody_out(tmp_path, monkeypatch):
+    path = tmp_path / "lock"
+    path.touch()  # of a process that was killed
+    with path.open() as asking:
+        fcntl.flock(asking, fcntl.LOCK_SH)
+        monkeypatch.setattr(files.time, "sleep", lambda _: fcntl.flock(asking, fcntl.LOCK_UN))
+        Lock(path, "works").release()
+
+
 def test_a_file_is_replaced_when_it_is_complete(tmp_path):
     path, link = tmp_path / "new" / "film.mp4", tmp_path / "link.mp4"
     link.symlink_to(path)
