@@ -2,18 +2,42 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import wraps
 from typing import Literal, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.utils._python_dispatch import _disable_current_modes
 
 from ba_torchrl.core import hardware
 
 Value = TypeVar("Value")
+
+
+@contextlib.contextmanager
+def real_tensors() -> Iterator[None]:
+    """Context that makes tensors for the whole process, whatever the caller's context is.
+
+    New tensors are on the CPU and have values; they are not those of a `torch.device` context, of
+    an export's fake tensors or of `torch.inference_mode`. Also a decorator.
+    """
+    with torch.inference_mode(False), torch.device("cpu"), _disable_current_modes():
+        yield
+
+
+def can_be_kept(value: object) -> bool:
+    """Return whether a result of a forward pass may be used in other forward passes.
+
+    A fake tensor of an export, and a tensor inside a transform of ``torch.func``, may not. What
+    `torch.compile` keeps is the tensor of the compiled call.
+    """
+    if torch.compiler.is_dynamo_compiling() or not isinstance(value, Tensor):
+        return True
+    return type(value) is Tensor and not torch._C._functorch.is_functorch_wrapped_tensor(value)
 
 
 def cached_constant(
@@ -23,7 +47,7 @@ def cached_constant(
 
     `torch.compile` ignores the cache of `functools.lru_cache` and would compute the result in each
     call of a graph. It reads this one, whose entries are inputs of the graph, and compiles a graph
-    again in whose first call an entry was missing.
+    again in whose first call an entry was missing. Results that `can_be_kept` refuses are not kept.
 
     Args:
         maxsize: number of results that are kept, the newest ones; None for all.
@@ -38,6 +62,8 @@ def cached_constant(
                 # a tensor of inference mode could not be used in a later training step
                 with torch.inference_mode(False):
                     result = function(*args)
+                if not can_be_kept(result):
+                    return result
                 if maxsize is not None and len(results) >= maxsize:
                     del results[next(iter(results))]
                 results[args] = result

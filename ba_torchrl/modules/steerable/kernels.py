@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ba_torchrl.modules.layers import can_be_kept, real_tensors
 from ba_torchrl.modules.steerable.irrep_convolution import IrrepKernels, irrep_kernels
 from ba_torchrl.modules.steerable.planar import PlanarSpace, sampled_kernels
 from ba_torchrl.modules.steerable.planar_escnn import import_escnn
@@ -53,11 +54,15 @@ class KernelBlock:
         key = (like.device, like.dtype)
         if key not in self._copies:
             with torch.inference_mode(False):  # for later training steps
-                self._copies[key] = self.kernels.flatten(1).to(like)
+                copy = self.kernels.flatten(1).to(device=like.device, dtype=like.dtype)
+            if not can_be_kept(copy):
+                return copy
+            self._copies[key] = copy
         return self._copies[key]
 
 
 @cache
+@real_tensors()
 def kernel_block(
     gspace: GSpace2D | PlanarSpace,
     in_repr: Representation,
@@ -102,6 +107,7 @@ def kernel_block(
 
 
 @cache
+@real_tensors()
 def regular_irrep_kernels(gspace: GSpace2D, rep: Representation) -> IrrepKernels | None:
     """Return the 3x3 kernels between fields of a representation in the basis of irreps."""
     block = kernel_block(gspace, rep, rep, 3)
@@ -137,8 +143,10 @@ def he_scales(
     }
 
 
-def bias_expansion(out_types: FieldTypes) -> Tensor:
-    """Return [channels, biases]: a bias acts on a trivial irrep, mapped into its field's basis."""
+@real_tensors()
+def bias_block(out_types: FieldTypes) -> KernelBlock:
+    """Return the kernels [biases, channels] of biases, which act on trivial irreps, mapped into the
+    bases of their fields."""
     columns, channels = [], sum(rep.size * count for rep, count in out_types)
     start = 0
     for rep, count in out_types:
@@ -153,4 +161,4 @@ def bias_expansion(out_types: FieldTypes) -> Tensor:
                 column[start : start + rep.size] = values
                 columns.append(column)
             start += rep.size
-    return torch.stack(columns, dim=1) if columns else torch.zeros(channels, 0)
+    return KernelBlock(torch.stack(columns) if columns else torch.zeros(0, channels), (), ())

@@ -18,6 +18,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.core.errors import MissingPackageError
+from ba_torchrl.modules.layers import can_be_kept
 from ba_torchrl.modules.steerable.cpu_threads import is_plain_float32
 from ba_torchrl.modules.steerable.irrep_convolution import (
     IrrepKernels,
@@ -26,8 +27,7 @@ from ba_torchrl.modules.steerable.irrep_convolution import (
 )
 from ba_torchrl.modules.steerable.kernels import (
     FieldTypes,
-    KernelBlock,
-    bias_expansion,
+    bias_block,
     he_scales,
     kernel_block,
     regular_irrep_kernels,
@@ -42,7 +42,8 @@ if TYPE_CHECKING:
 _expanded: ContextVar[dict[tuple[Any, ...], tuple[Any, ...]] | None] = ContextVar(
     "expanded", default=None
 )
-"""Inside `reuse_filters`: filters with their weights, by layer, dtype and ids of the weights."""
+"""Inside `reuse_filters`: filters with their weights, by layer, dtype, autocasting and ids of the
+weights."""
 
 
 @contextlib.contextmanager
@@ -148,9 +149,8 @@ class SteerableConv2d(nn.Module):
             is_small = in_repr.size <= 8  # kernels of large groups take seconds to convert
             if in_repr is out_repr and is_small and not others and not other_outputs:
                 self._irrep_kernels = regular_irrep_kernels(gspace, in_repr)
-        expansion = bias_expansion(out_types)
-        self._bias_block = KernelBlock(expansion.t().contiguous(), (), ())
-        count = expansion.shape[1]
+        self._bias_block = bias_block(out_types)
+        count = len(self._bias_block.kernels)
         self.bias = nn.Parameter(torch.zeros(count)) if count else None
 
     @staticmethod
@@ -200,9 +200,13 @@ class SteerableConv2d(nn.Module):
         # The tensors that a functional call puts in place of the parameters have other ids; they
         # are kept with the result, so that no id is used again.
         weights = tuple(self.parameters())
-        key = (self, dtype, *map(id, weights))
+        is_autocast = torch.is_autocast_enabled(weights[0].device.type)
+        key = (self, dtype, is_autocast, *map(id, weights))
         if key not in kept:
-            kept[key] = (self.expand(dtype), weights)
+            filters = self.expand(dtype)
+            if not can_be_kept(filters[0]):
+                return filters
+            kept[key] = (filters, weights)
         return kept[key][0]
 
     def forward(self, x: Tensor) -> Tensor:
@@ -279,7 +283,7 @@ class DynamicSteerableConv2d(nn.Module):
         self.count, self.size, self.kernel_size = count, representation.size, kernel_size
         types = [(representation, count)]
         (self._scales,) = he_scales({(0, 0): block}, types, types).values()
-        self._bias_block = KernelBlock(bias_expansion(types).t().contiguous(), (), ())
+        self._bias_block = bias_block(types)
         self.num_weights = count * count * len(block.in_irreps)
         self.num_biases = len(self._bias_block.kernels)
 
