@@ -11,13 +11,12 @@ import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterable, Iterator, Sequence
-from importlib.resources import files
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jinja2 import Environment
+from jinja2 import Environment, PackageLoader
 
 from ba_torchrl.core.files import replaced, write_text
 from ba_torchrl.record.plots import Learning, plot_panels
@@ -146,25 +145,39 @@ def write_report(
             for point in run.result.curve
         ],
     }.items():
-        path = folder / f"{name}.csv"
-        with replaced(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
-            writer.writeheader()
-            writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
+        write_csv(folder / f"{name}.csv", rows)
     texts = [_DEFINITIONS, *map(_markdown, parts)]
     if left_out:
         listed = (f"- {markdown(run)}" for run in left_out)
         texts.append("\n".join(["## Not finished", "", *listed]))
     write_text(folder / "table.md", "\n\n".join(texts) + "\n")
-    template = files("ba_torchrl.record").joinpath("report.html").read_text(encoding="utf-8")
-    page = Environment(autoescape=True, trim_blocks=True, lstrip_blocks=True).from_string(template)
-    text = page.render(
+    return write_page(
+        folder / "report.html",
         sections=parts,
         definitions=_DEFINITIONS,
         unfinished=left_out,
         made=now(),
     )
-    return write_text(folder / "report.html", text)
+
+
+def write_page(path: Path, **values: Any) -> Path:
+    """Write a page from the template of its name, and return its path.
+
+    Args:
+        path: of the page.
+        values: what the template shows; it is escaped.
+    """
+    folder = PackageLoader("ba_torchrl.record", ".")
+    pages = Environment(loader=folder, autoescape=True, trim_blocks=True, lstrip_blocks=True)
+    return write_text(path, pages.get_template(path.name).render(**values))
+
+
+def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
+    """Write rows with the same keys as a CSV file, which is safe to open in a spreadsheet."""
+    with replaced(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
+        writer.writeheader()
+        writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
 
 
 def plot_groups(
