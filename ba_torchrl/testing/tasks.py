@@ -33,6 +33,7 @@ from ba_torchrl.testing.episodes import (
     play_expert,
     random_actions,
 )
+from ba_torchrl.testing.labels import label_jump_share
 from ba_torchrl.testing.progress import check_progress
 
 Policy = Callable[[TensorDictBase], TensorDictBase]
@@ -42,6 +43,11 @@ POLICY_NOISE = 0.1
 MAX_NOISE_LOSS = 0.3
 """Largest difference of an expert's success rates without and with this noise that gives no
 warning; that of the package's close-loop tasks is at most 0.1."""
+MAX_LABEL_JUMPS = 0.1
+"""Largest share of label jumps that gives no warning; that of the package's tasks is at most
+0.05."""
+JUMP_EPISODES = 3
+"""Most episodes in whose states the expert is asked again."""
 
 
 class ExpertReport(NamedTuple):
@@ -57,23 +63,35 @@ class ExpertReport(NamedTuple):
     """Share of episodes that are solved with Gaussian noise of `POLICY_NOISE`, about that of a
     learned policy. None in open loop, where a policy chooses a pixel."""
 
+    label_jumps: float = 0.0
+    """Share of states in which the expert's action changes with the last bits of the state; see
+    `ba_torchrl.testing.labels`."""
+
     @property
     def warning(self) -> str | None:
-        """What to change if noise lowers the success rate by more than `MAX_NOISE_LOSS`."""
-        noisy = self.noisy_success_rate
-        if noisy is None or noisy >= self.success_rate - MAX_NOISE_LOSS:
-            return None
-        return (
-            f"{self.task}: the expert solves {self.success_rate:.2f} of its episodes, and "
-            f"{noisy:.2f} with the noise of a learned policy, which will hardly imitate it. Widen "
-            "the tolerances of `evaluate` and the thresholds between the expert's phases"
-        )
+        """What to change if noise lowers the success rate by more than `MAX_NOISE_LOSS`, or if more
+        than `MAX_LABEL_JUMPS` of the expert's actions jump."""
+        found, noisy = [], self.noisy_success_rate
+        if noisy is not None and noisy < self.success_rate - MAX_NOISE_LOSS:
+            found.append(
+                f"{self.task}: the expert solves {self.success_rate:.2f} of its episodes, and "
+                f"{noisy:.2f} with the noise of a learned policy, which will hardly imitate it. "
+                "Widen the tolerances of `evaluate` and the thresholds between the expert's phases"
+            )
+        if self.label_jumps > MAX_LABEL_JUMPS:
+            found.append(
+                f"{self.task}: in {self.label_jumps:.2f} of the states, the expert's action jumps "
+                "with the last bits of the state, which no policy sees. Let the expert prefer one "
+                "of several equal choices by a margin"
+            )
+        return "\n".join(found) or None
 
     def __str__(self) -> str:
         text = f"{self.task}: the expert solves {self.success_rate:.2f} of its episodes in "
         text += f"{self.mean_steps:.1f} steps"
         if self.noisy_success_rate is not None:
             text += f", and {self.noisy_success_rate:.2f} with the noise of a learned policy"
+        text += f"; its action jumps with the last bits of {self.label_jumps:.2f} of the states"
         return text if self.warning is None else f"{text}\nwarning: {self.warning}"
 
 
@@ -88,7 +106,8 @@ def check_task(
 ) -> ExpertReport:
     """Check that a task fulfils the contract of this package's tasks; takes about a minute.
 
-    An expert whose success depends on exact actions passes, with a warning.
+    An expert passes with a warning if its success depends on exact actions, or if its actions jump
+    with the last bits of the state.
 
     Args:
         episodes: number of episodes that the expert plays, both from the start and after random
@@ -120,6 +139,8 @@ def check_task(
     if TASKS[task].control == "close_loop":
         rate = noisy_success_rate(task, episodes=episodes, robot=robot)
         report = report._replace(noisy_success_rate=rate)
+    jumps = label_jump_share(task, episodes=min(episodes, JUMP_EPISODES), robot=robot)
+    report = report._replace(label_jumps=jumps)
     if report.warning is not None:
         warnings.warn(report.warning, stacklevel=2)
     return report
