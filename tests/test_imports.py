@@ -25,7 +25,7 @@ EXTRA = {
     "algorithms": {"__init__", "data", "modules", "objectives"},
     "training": {"__init__", "data", "record"},
     "cli": {"__init__", "record"},
-    "commands": {"__init__", "data", "record", "modules"},
+    "commands": {"__init__", "data", "record", "modules", "testing"},
     "__main__": {"cli"},
     "recipes": {"__init__", "record"},
 }
@@ -36,7 +36,8 @@ APART = {
     "data": {"core", "data"},
     "modules": {"core", "modules"},
     "objectives": {"core", "objectives"},
-    "record": {"core", "record", "sim", "tasks", "envs", "demonstrations", "__init__"},
+    "record": {"core", "record", "sim", "tasks", "envs", "demonstrations", "testing"}
+    | {"__init__"},
     # measurements, which read every part
     "recipes.profiling": {"core", "__init__", "sim", "tasks", "envs", "demonstrations", "data"}
     | {"modules", "objectives", "algorithms", "training", "record"},

@@ -155,7 +155,13 @@ def check_command_line(line: str) -> None:
     if not words:  # the name of a command in the text
         assert name in command_names()
         return
-    if name in {"evaluate", "report", "leaderboard", "export"}:  # the runs that they read
+    if name in {
+        "evaluate",
+        "diagnose",
+        "report",
+        "leaderboard",
+        "export",
+    }:  # the runs that they read
         for folder in [word for word in words if word.startswith("runs/")]:
             Path(folder).mkdir(parents=True)
     command = importlib.import_module(f"ba_torchrl.commands.{name}").COMMAND

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, Seed, Text, VectorSettings, VideoFile
+from ba_torchrl.cli.types import Count, PluginSettings, Seed, Text, VectorSettings, VideoFile
 from ba_torchrl.core.config import FIRST_TEST_SEED, LocalPath, Which
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import CITABLE_EPISODES, TestedPolicy
@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from ba_torchrl.training.policy import TrainedPolicy
 
 
-class EpisodeSettings(VectorSettings):
-    """A policy and the episodes that it plays."""
+class PolicySettings(PluginSettings):
+    """A policy."""
 
     policy: LocalPath
     """A run folder, one of the checkpoints in it, a .safetensors file, or a task whose policy the
@@ -31,6 +31,11 @@ class EpisodeSettings(VectorSettings):
     """Of a run folder: the checkpoint with the best evaluation, or the latest."""
     device: Text = "auto"
     """Where the policy is computed, whatever device it was trained on."""
+
+
+class EpisodeSettings(PolicySettings, VectorSettings):
+    """A policy and the episodes that it plays."""
+
     episodes: Count = 100
     """Their number. A number to cite has 500, at least 200."""
 

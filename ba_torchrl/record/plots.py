@@ -1,4 +1,4 @@
-"""Figures of learning curves."""
+"""Figures of learning curves and of failures."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from matplotlib import rc_context, rcdefaults, rcParams
@@ -19,11 +19,16 @@ from numpy.typing import ArrayLike
 from ba_torchrl.core.files import replaced
 from ba_torchrl.record.summary import printable
 
+if TYPE_CHECKING:
+    from ba_torchrl.testing.diagnosis import Picture
+
 # Distinguishable by colour-blind readers (Okabe and Ito), in order of decreasing contrast.
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _STYLES = ("-", "--", ":", "-.")
 _MARKERS = "osD^vPX*<>"
 _MOST_MARKERS = 25
+_LIGHT = ("#56B4E9", "#E69F00", "#009E73")
+"""Of lines on a dark image."""
 _LABEL_PT = 7
 _LABEL_WIDTH = 24
 """Characters in a line of a label beside a panel."""
@@ -110,12 +115,52 @@ def plot_panels(
 
 
 @own_style()
+def plot_failure(picture: Picture, path: Path) -> None:
+    """Draw the actions of policy and expert into the height image, beside a view of the scene.
+
+    Each gripper is a line between its open fingers. In close loop, arrows lead from the tool to it.
+    """
+    figure = Figure(figsize=(9.5, 4.4), dpi=100, layout="constrained")
+    above, view = figure.subplots(1, 2, width_ratios=(1, 1.1))
+    above.imshow(
+        picture.heights,
+        cmap="gray",
+        extent=(*picture.y_m, *reversed(picture.x_m)),  # rows follow x, columns y
+    )
+    if picture.tool is not None:
+        _draw_gripper(above, picture, picture.tool, "tool", "0.75", 2.0)
+    for number, (who, *pose, text) in enumerate(picture.arrows):
+        style = _LIGHT[number], 4.0 - 1.2 * number
+        _draw_gripper(above, picture, pose, f"{who}: {text}", *style)
+        if picture.tool is not None:
+            way = {"arrowstyle": "->", "color": style[0], "lw": style[1] / 2}
+            above.annotate("", pose[1::-1], picture.tool[1::-1], arrowprops=way)
+    above.set(xlim=picture.y_m, ylim=picture.x_m[::-1], xlabel="y (m)", ylabel="x (m)")
+    above.tick_params(labelsize=_LABEL_PT)
+    view.imshow(picture.rgb)
+    view.set_axis_off()
+    figure.legend(loc="outside lower center", fontsize=8)
+    save(figure, path)
+
+
+@own_style()
 def save(figure: Figure, path: Path) -> None:
     """Write a figure, to the same file for the same content."""
     metadata = {"Date": None} if path.suffix == ".svg" else None
     rcParams["svg.hashsalt"] = path.stem
     with replaced(path) as scratch:
         figure.savefig(scratch, metadata=metadata)
+
+
+def _draw_gripper(
+    axes: Axes, picture: Picture, pose: Sequence[float], label: str, color: str, width: float
+) -> None:
+    """Draw the open fingers at a position and yaw, with a point between them."""
+    x, y, yaw = pose
+    half_x, half_y = (picture.finger_gap_m * part(yaw) for part in (math.cos, math.sin))
+    marks = {"marker": "s", "markersize": 2 * width, "markevery": [0, 2]}
+    along_y, along_x = (y - half_y, y, y + half_y), (x - half_x, x, x + half_x)
+    axes.plot(along_y, along_x, color=color, linewidth=width, label=label, **marks)
 
 
 def _draw(axes: Axes, number: int, method: Learning) -> Line2D:

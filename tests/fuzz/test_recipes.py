@@ -20,6 +20,7 @@ WORK = {
     "measure": "measure",
     "speed": "steps_per_second",
     "evaluate": None,  # there is no checkpoint
+    "diagnose": None,  # there is no checkpoint
     "train": "ba_torchrl.training.experiment.Experiment",
     "benchmark": "plan",
     "report": None,  # there is no finished run
@@ -39,6 +40,7 @@ VALUES = st.one_of(st.sampled_from(TEXTS), st.text(max_size=5), st.integers().ma
 
 REQUIRED = {
     "evaluate": ["policy=run"],
+    "diagnose": ["policy=run"],
     "export": ["policy=run"],
     "train": ["run_dir=new"],
     "benchmark": ["folder=new"],
