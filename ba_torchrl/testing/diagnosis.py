@@ -287,7 +287,7 @@ class _Examiner:
         successes["policy"] = self._play_on(saved, self._same_bits).is_solved
         if to_go is None:
             kind = EXPERT_FAILS
-        elif len(played.actions) - step < to_go:
+        elif self.env.max_steps - step < to_go:
             kind = OUT_OF_STEPS
         elif self._repeats(played):
             kind = REPEATS

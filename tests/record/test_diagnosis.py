@@ -93,6 +93,12 @@ def beside(state, expert, number):
     return expert
 
 
+def outside(state, expert, number):
+    """Places at the border of the workspace, which ends the episode."""
+    expert[1] = torch.where(expert[0] > 0, 0.65, expert[1])
+    return expert
+
+
 def nowhere(state, expert, number):
     """Picks where no object is near."""
     far = ndimage.distance_transform_edt(state[keys.HEIGHTMAP][0].numpy() < 0.005)
@@ -124,7 +130,7 @@ def test_kinds_of_failures(task, policy, limit, kind, stage, tmp_path):
     assert [row.policy.distance_mm > 1 for row in found.states[:2]] == [
         kind == diagnosis.OUT_OF_STEPS
     ] * 2
-    if stage == "place 2 of 3":
+    if kind == diagnosis.PLACES_OFF:
         assert failure.step == 3
         assert failure.to_go == 3
         assert abs(failure.policy.x_mm) == pytest.approx(90, abs=0.01)
@@ -138,6 +144,15 @@ def test_kinds_of_failures(task, policy, limit, kind, stage, tmp_path):
     assert (tmp_path / "new" / re.search(r'img .*src="(.*)"', page)[1]).read_bytes()[1:4] == b"PNG"
     (row,) = csv.DictReader((tmp_path / "new/failures.csv").open())
     assert (row["kind"], row["expert succeeds"]) == (kind, str(reached))
+
+
+def test_an_invalid_scene_is_no_lack_of_steps():
+    config = {"expert": True, "max_steps": 6, "workspace_check": "bounding_box"}
+    with closing(make_small(STACK, **config)) as env:
+        (failure,) = diagnose(env, policy_of(then=outside), [0]).failures
+    assert (failure.kind, failure.step, failure.steps) == (diagnosis.PLACES_OFF, 3, 4)
+    assert failure.to_go > failure.steps - failure.step
+    assert failure.successes["policy, then expert"] is False
 
 
 @pytest.mark.parametrize("task", [PICK, STACK])
