@@ -66,6 +66,28 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
     env.close()
 
 
+@pytest.mark.slow  # of a minute
+@pytest.mark.parametrize("task", ["close_loop/block_picking", "open_loop/block_stacking"])
+def test_a_policy_is_exported_without_a_pass_before(task):
+    policy = ba_torchrl.load_policy(task)
+    with closing(policy.make_env(seed=0)) as env:
+        seen = env.reset().select(*policy.in_keys)
+
+    class Net(torch.nn.Module):
+        def __init__(self):
+            super().__init__()
+            self.policy = policy
+
+        def forward(self, *entries):
+            return self.policy(
+                seen.select(*policy.in_keys).update(dict(zip(policy.in_keys, entries, strict=True)))
+            )["action"]
+
+    entries = tuple(seen[key] for key in policy.in_keys)
+    exported = torch.export.export(Net(), entries, strict=True).module()
+    torch.testing.assert_close(exported(*entries), policy(seen.clone())["action"])
+
+
 def test_an_observation_without_what_the_policy_reads_is_named(run):
     policy = ba_torchrl.load_policy(run)
     state = TensorDict({"holding": torch.zeros(1, dtype=torch.bool)}, batch_size=[])

@@ -51,8 +51,11 @@ def reuse_filters() -> Iterator[None]:
     """Expand each filter once inside the context, in which no weight may change.
 
     For evaluation, where the weights are constant and batches small. Forward passes with gradients
-    expand their filters as usual.
+    expand their filters as usual, and so does code that is compiled or exported.
     """
+    if torch.compiler.is_compiling():  # which traces no context variable
+        yield
+        return
     token = _expanded.set({})
     try:
         yield
