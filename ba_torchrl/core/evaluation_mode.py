@@ -9,6 +9,7 @@ from __future__ import annotations
 import copy
 from typing import TypeVar
 
+from tensordict import TensorDictParams
 from torch import nn
 
 Network = TypeVar("Network", bound=nn.Module)
@@ -18,7 +19,7 @@ def evaluation_copy(network: Network) -> Network:
     """Return a copy of a network in evaluation mode, with the same parameters and buffers.
 
     The copy computes with the latest parameters and statistics and changes neither, in whichever
-    mode the network is. Only modules are copied, not tensors.
+    mode the network is. A tensor that is neither a parameter nor a buffer is copied.
 
     Examples:
         >>> import torch
@@ -28,5 +29,6 @@ def evaluation_copy(network: Network) -> Network:
         >>> acting.training, network.training, acting[0].weight is network[0].weight
         (False, True, True)
     """
-    shared = {id(tensor): tensor for tensor in (*network.parameters(), *network.buffers())}
-    return copy.deepcopy(network, shared).eval()
+    params = (part for part in network.modules() if isinstance(part, TensorDictParams))
+    kept = (*network.parameters(), *network.buffers(), *params)
+    return copy.deepcopy(network, {id(each): each for each in kept}).eval()

@@ -3,12 +3,14 @@
 import pytest
 import torch
 from tensordict import TensorDict
+from tensordict.nn import EnsembleModule, TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import parse
+from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from ba_torchrl.modules.base import ActorCritic
 from ba_torchrl.modules.spatial.asr import ASRConfig
@@ -144,3 +146,11 @@ def test_the_average_of_a_policy_has_statistics_of_its_own():
         if value.is_floating_point() and "mask" not in key:
             second = (first + second) / 2
         torch.testing.assert_close(value.detach(), second)
+
+
+def test_a_copy_shares_the_parameters_that_a_tensordict_holds():
+    network = EnsembleModule(TensorDictModule(nn.Linear(2, 3), ["seen"], ["action"]), 2)
+    acting = evaluation_copy(network)
+    assert [*map(id, acting.parameters())] == [*map(id, network.parameters())]
+    assert network.training
+    assert not acting.training
