@@ -239,11 +239,15 @@ class MappedFile:
         """Warn of more zeros than the environment's images have, and of points at the origin."""
         for key in self._specs:
             most = self._images[key].max_zeros if key in self._images else 1.0
-            zeros = [arrays[key] == 0 for arrays in episodes]
-            if key == keys.POINT_CLOUD:
-                most, zeros = 0.0, [each.all(-1) for each in zeros]
-            share = sum(each.sum() for each in zeros) / sum(each.size for each in zeros)
-            if share > most:
+            is_points = key == keys.POINT_CLOUD
+            if most >= 1 and not is_points:
+                continue
+            most, zeros, count = 0.0 if is_points else most, 0, 0
+            for arrays in episodes:  # one at a time, since the images may fill the memory
+                is_zero = arrays[key] == 0
+                is_zero = is_zero.all(-1) if is_points else is_zero
+                zeros, count = zeros + is_zero.sum(), count + is_zero.size
+            if (share := zeros / count) > most:
                 logger.warning(
                     "%s: %.0f %% of %s is 0 m, as where a camera has no return; the environment "
                     "has at most %.0f %%. Fill in these values",
