@@ -270,8 +270,9 @@ class WorkerOptions(StrictModel):
     """Seconds after which a process that does not answer is replaced."""
     max_restarts: int = Field(default=5, ge=0)
     """Largest number of failures in a row of a process: of attempts to start it, or of resets and
-    steps without a completed step. Ten failures without an undisturbed episode, or more if this
-    number is larger, are too many as well. The end of an idle process does not count."""
+    steps without a completed step. Ten failures with no undisturbed episode in between end the run
+    as well, in collectors ``max_restarts + 1`` if that is more. The end of an idle process does not
+    count."""
     start_timeout_s: float = Field(default=120.0, gt=0)
     """Seconds after which a process that does not start is replaced."""
     wait_for_restarts: bool = True

@@ -249,8 +249,8 @@ class MappedFile:
                 zeros, count = zeros + is_zero.sum(), count + is_zero.size
             if (share := zeros / count) > most:
                 logger.warning(
-                    "%s: %.0f %% of %s is 0 m, as where a camera has no return; the environment "
-                    "has at most %.0f %%. Fill in these values",
+                    "%s: %.0f %% of %s is 0 m, which cameras write where they measure nothing; the "
+                    "environment has at most %.0f %%. Fill in these values",
                     self._path,
                     100 * share,
                     key,

@@ -978,7 +978,7 @@ def test_a_zarr_folder_without_its_ends_is_refused(tmp_path):
         ([3, 3], "do not rise"),
         ([3, 6.7], "episode_ends: the end 6.7 is no whole number of steps"),
         ([3, np.nan], "the end nan is no"),
-        ([*range(1, 7)], "there are 6 ends, and 5 steps in data"),
+        ([*range(1, 7)], "6 episodes end, but data has 5 steps"),
         ([[3, 5]], "needed one whole number per episode"),
     ):
         store_zarr(zarr.open_group(str(path), mode="a"), "meta/episode_ends", np.array(ends))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import sys
 from collections.abc import Iterable, Mapping, Sequence
@@ -133,8 +134,13 @@ class LeRobot(Format):
 
 
 def _local(base: type, download: str) -> type:
-    """Return a class of LeRobot that does not load from the Hub what the folder lacks."""
+    """Return a class of LeRobot that does not load from the Hub what the folder lacks.
 
+    Raises:
+        AttributeError: this release of LeRobot downloads by another method.
+    """
+
+    @functools.wraps(getattr(base, download))
     def refuse(self: Any, *_: object, **__: object) -> None:
         if isinstance(sys.exc_info()[1], OSError):  # of the file that is missing
             raise

@@ -113,7 +113,7 @@ def _ends(array: Any, steps: int) -> list[int]:
     if len(array.shape) != 1 or array.dtype.kind not in "iuf":
         raise ConfigError(f"needed one whole number per episode, found {array.dtype} {array.shape}")
     if array.shape[0] > steps:
-        raise ConfigError(f"there are {array.shape[0]} ends, and {steps} steps in data")
+        raise ConfigError(f"{array.shape[0]} episodes end, but data has {steps} steps")
     found = array[:]
     if not (is_whole := np.isfinite(found) & (found == np.floor(found))).all():
         raise ConfigError(f"the end {found[~is_whole][0]:g} is no whole number of steps")
