@@ -31,4 +31,17 @@ def evaluation_copy(network: Network) -> Network:
     """
     params = (part for part in network.modules() if isinstance(part, TensorDictParams))
     kept = (*network.parameters(), *network.buffers(), *params)
-    return copy.deepcopy(network, {id(each): each for each in kept}).eval()
+    return evaluated(copy.deepcopy(network, {id(each): each for each in kept}))
+
+
+def evaluated(network: Network) -> Network:
+    """Set a network to evaluation mode and return it.
+
+    Convolutions of escnn stay in training mode, which changes nothing but that they expand their
+    filters in each pass: in evaluation mode they keep the filters of the weights at this moment.
+    """
+    if not hasattr(network, "expand_parameters"):
+        network.training = False
+        for child in network.children():
+            evaluated(child)
+    return network

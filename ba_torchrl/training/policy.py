@@ -405,7 +405,7 @@ def _of_test(test: TestedPolicy, protocol: int, precision: str) -> dict[str, Any
     """Return the fields of a card that a test determines."""
     return {
         "success_rate": test.success_rate,
-        "interval": [float(end) for end in wilson(test.success_rate, test.episodes)[1:]],
+        "interval": tuple(map(float, wilson(test.success_rate, test.episodes)[1:])),
         "episodes": test.episodes,
         "protocol": protocol,
         "precision": precision,

@@ -162,7 +162,11 @@ def test_updates_leave_the_modes_and_are_compiled_once():
 def test_results_are_copies_and_priorities_are_written():
     learner = build("sac", "cnn", **SACFD)
     loss = CompiledLoss(learner.loss, "default")
-    handle = learner.loss.register_forward_pre_hook(lambda module, _: module.target_entropy.sub_(1))
+
+    def change(module, _):
+        module.target_entropy.sub_(1)
+
+    handle = learner.loss.register_forward_pre_hook(change)
     loss(learner.sample())
     assert float(learner.loss.target_entropy) == -6.0  # the pass before compilation is undone
     handle.remove()

@@ -7,6 +7,7 @@ from tensordict.nn import EnsembleModule, TensorDictModule
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
+from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import parse
@@ -14,6 +15,8 @@ from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from ba_torchrl.modules.base import ActorCritic
 from ba_torchrl.modules.spatial.asr import ASRConfig
+from ba_torchrl.modules.steerable.layers import planar_rotations
+from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 from tests.algorithms.tiny import FERM, SIZES, problem, transitions
 
 
@@ -154,3 +157,18 @@ def test_a_copy_shares_the_parameters_that_a_tensordict_holds():
     assert [*map(id, acting.parameters())] == [*map(id, network.parameters())]
     assert network.training
     assert not acting.training
+
+
+def test_a_copy_of_escnn_layers_has_the_latest_filters():
+    pytest.importorskip("escnn")
+    escnn = import_escnn("escnn.nn")
+    rotations = planar_rotations(4)
+    one, two = (
+        escnn.FieldType(rotations, [each])
+        for each in (rotations.trivial_repr, rotations.regular_repr)
+    )
+    network = escnn.R2Conv(one, two, 3)
+    acting = ActingPolicy(TensorDictModule(network, ["seen"], ["action"]), []).policy.module
+    image = escnn.GeometricTensor(torch.rand(1, 1, 5, 5), one)
+    torch.nn.init.normal_(network.weights)
+    torch.testing.assert_close(acting(image).tensor, network(image).tensor)

@@ -165,7 +165,7 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
     with ReadsOnTheHost() as reads:
         learner.minimize(batch, learner.stages)
     # AveragedModel reads its own counter, which is on the CPU for any device
-    counter = 2 * ["aten::_local_scalar_dense"] if learner.averaged_policy is not None else []
+    counter = 3 * ["aten::_local_scalar_dense"] if learner.averaged_policy is not None else []
     assert reads.found == counter
     assert len(learner.host_tasks) == len(learner.stages)
 
