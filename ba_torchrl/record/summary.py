@@ -468,4 +468,5 @@ def _columns(name: str, found: Estimate, prefix: str = "") -> dict[str, float]:
 
 
 def _mean(values: Iterable[float]) -> float:
-    return float(np.mean(list(values)))
+    found = list(values)
+    return float(np.mean(found)) if found else math.nan

@@ -163,7 +163,7 @@ def test_steps_to_next_obs_raises_gamma():
     data = batch(weights=None)
     data["steps_to_next_obs"] = torch.full((4, 1), 3)
     expected, _ = by_hand(loss, data, 0.9**3, 0.2, -5, 1)
-    assert float(loss(data)["loss_qvalue"]) == pytest.approx(expected["loss_qvalue"], rel=1e-6)
+    assert loss(data)["loss_qvalue"].item() == pytest.approx(expected["loss_qvalue"], rel=1e-6)
 
 
 def test_plain_sac_needs_no_expert_flag():
@@ -172,7 +172,7 @@ def test_plain_sac_needs_no_expert_flag():
     data = batch(experts=None)
     out = loss(data)
     expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 0)
-    assert float(out["loss_actor"]) == pytest.approx(expected["loss_actor"], rel=1e-6)
+    assert out["loss_actor"].item() == pytest.approx(expected["loss_actor"], rel=1e-6)
     assert out["demonstration_error"] == 0
     with pytest.raises(KeyError, match="demonstration_weight=0"):
         make()(data)
@@ -516,7 +516,7 @@ def test_anchors_are_features_and_positives_those_of_the_target_encoder():
     expected = loop(anchors, loss.contrastive.weight.tolist(), positives)
     out = loss.contrastive_loss(data)
     assert list(out.keys()) == ["loss_contrastive"]
-    assert float(out["loss_contrastive"]) == pytest.approx(sum(expected) / 4, rel=1e-9)
+    assert out["loss_contrastive"].item() == pytest.approx(sum(expected) / 4, rel=1e-9)
     none = contrastive(reduction="none").contrastive_loss(data)["loss_contrastive"]
     assert none.tolist() == pytest.approx(expected, rel=1e-9)
 

@@ -163,7 +163,7 @@ def test_samplers_of_torchrl_are_loaded_fast(tmp_path):
         assert first.query(0, 14_000) == second.query(0, 14_000)
 
 
-def make(flags, bonus=1.0, seed=0, capacity=None, **settings):
+def make(flags, bonus=1.0, seed=0, capacity=None, batch_size=4000, **settings):
     """A buffer of small transitions whose expert flags are given."""
     capacity = capacity or len(flags)
     sampler = ExpertPrioritizedSampler(
@@ -174,7 +174,7 @@ def make(flags, bonus=1.0, seed=0, capacity=None, **settings):
     buffer = TensorDictReplayBuffer(
         storage=LazyTensorStorage(capacity),
         sampler=sampler,
-        batch_size=4000,
+        batch_size=batch_size,
         generator=torch.Generator().manual_seed(seed),
     )
     buffer.extend(transitions(flags))
@@ -239,8 +239,8 @@ def test_a_single_draw_has_one_index_and_one_weight():
     buffer, sampler = make(FLAGS)
     index, info = sampler.sample(buffer.storage, 1)
     assert index.shape == info["priority_weight"].shape == (1,)
-    one, _ = make([True], capacity=1)
-    assert one.sample(1)["x"].shape == (1,)
+    one, _ = make([True], capacity=1, batch_size=1)
+    assert one.sample()["x"].shape == (1,)
 
 
 def test_new_transitions_get_the_largest_priority_of_the_updates():
@@ -263,11 +263,11 @@ def test_new_transitions_get_the_largest_priority_of_the_updates():
 
 @pytest.mark.parametrize("method", ["extend", "add"])
 def test_the_largest_priority_does_not_grow_by_a_bonus_per_insertion(method):
-    buffer, sampler = make([True] * 4, bonus=1.0, capacity=16)
+    buffer, sampler = make([True] * 4, bonus=1.0, capacity=16, batch_size=4)
     for i in range(200):
         new = transitions([i % 2 == 0])
         getattr(buffer, method)(new if method == "extend" else new[0])
-        sample = buffer.sample(4)
+        sample = buffer.sample()
         sample["td_error"] = torch.full((4, 1), 0.2)
         buffer.update_tensordict_priority(sample)
     assert sampler.state_dict()["max_priority"][0] == pytest.approx(1.2 + EPS)
