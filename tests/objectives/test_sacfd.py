@@ -482,7 +482,7 @@ def loop(anchors, weight, positives):
 def test_the_loss_equals_a_loop():
     torch.manual_seed(0)
     head = BilinearInfoNCE(3).double()
-    assert 0 <= float(head.weight.min()) <= float(head.weight.max()) < 1
+    assert 0 <= head.weight.min().item() <= head.weight.max().item() < 1
     anchors, positives = torch.randn(5, 3).double(), torch.randn(5, 3).double()
     expected = loop(anchors.tolist(), head.weight.tolist(), positives.tolist())
     assert head(anchors, positives).tolist() == pytest.approx(expected, rel=1e-9)
