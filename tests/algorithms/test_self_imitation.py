@@ -54,13 +54,13 @@ def test_successes_are_imitated_where_the_expert_would_act_otherwise():
 @pytest.mark.parametrize("replay", ["uniform", "prioritized", "symmetric"])
 def test_successes_fill_at_most_half_of_the_replay(replay):
     learner = build(
-        "sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay, "capacity": 8}
+        "sac", imitation=SUCCESSES, batch_size=4, replay={"name": replay, "capacity": 6}
     )
     data = collected(learner, [True, True], [True, True])
-    for stored in (2, 4, 6, 8, 10):
+    for stored in (2, 4, 6, 8):  # of the second two, the half has room for one
         learner.on_collected(data)
-        assert learner.replay.num_demonstrations == min(stored, 4)
-        assert len(learner.replay) == min(stored, 8)
+        assert learner.replay.num_demonstrations == min(stored, 3)
+        assert len(learner.replay) == min(stored, 6)
 
 
 def test_collected_episodes_are_not_processed_as_those_before_the_first_update():

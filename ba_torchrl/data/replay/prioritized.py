@@ -79,9 +79,10 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
 
     def _init(self) -> None:
         """Make empty trees: TorchRL's native ones, or NumPy's if they did not load."""
-        self._sum_tree = (SumSegmentTreeFp64 or SumTree)(self._max_capacity)
-        self._min_tree = (MinSegmentTreeFp64 or MinTree)(self._max_capacity)
-        self._max_priority = None
+        self._sum_tree = (SumSegmentTreeFp64 or SumTree)(self.max_size)
+        self._min_tree = (MinSegmentTreeFp64 or MinTree)(self.max_size)
+        self._largest = 1.0
+        """The largest priority so far, of which the first transitions have one."""
 
     @property
     def default_priority(self) -> float:
@@ -178,17 +179,17 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             index: as of `update_priority`.
             storage: as of `update_priority`; needed if it has several dimensions.
         """
-        largest, _ = self._max_priority
-        largest = torch.as_tensor(largest or 1.0, dtype=self.dtype, device="cpu").clamp_min(1.0)
+        largest = torch.tensor(self._largest, dtype=self.dtype, device="cpu")
         self._set(index, largest, storage)
 
     def _set(self, index: Any, priority: Tensor, storage: Storage | None = None) -> None:
-        if (torch.as_tensor(index, device="cpu") >= self._max_capacity).any():
+        if (torch.as_tensor(index, device="cpu") >= self.max_size).any():
             raise ValueError(
-                f"the storage holds more than max_capacity={self._max_capacity} transitions: give "
+                f"the storage holds more than max_capacity={self.max_size} transitions: give "
                 "the sampler the capacity of the storage"
             )
         super().update_priority(index, priority, storage=storage)
+        self._largest = max(self._largest, float(priority.max()))
 
     def _bonus(self, index: Tensor, storage: Storage | None) -> Tensor | float:
         if not self.expert_bonus:
@@ -199,11 +200,10 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
 
     def state_dict(self) -> dict[str, Any]:
         """Return priorities and exponent, as tensors and numbers."""
-        everything = torch.arange(self._max_capacity, device="cpu")
-        largest, place = self._max_priority
+        everything = torch.arange(self.max_size, device="cpu")
         return {
             "leaves": torch.as_tensor(self._sum_tree[everything], device="cpu").reshape(-1).clone(),
-            "max_priority": (None, None) if largest is None else (float(largest), int(place)),
+            "max_priority": (self._largest, None),  # and TorchRL's index of it, which nothing reads
             "beta": self.beta,
         }
 
@@ -217,18 +217,16 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             ValueError: the capacities differ.
         """
         leaves = state_dict["leaves"]
-        if leaves.numel() != self._max_capacity:
+        if leaves.numel() != self.max_size:
             raise ValueError(
-                f"the saved sampler has capacity {leaves.numel()}, this one {self._max_capacity}"
+                f"the saved sampler has capacity {leaves.numel()}, this one {self.max_size}"
             )
         self._init()
         written = leaves.nonzero().reshape(-1)  # priorities of stored transitions are positive
         if written.numel():
             self._sum_tree[written] = leaves[written]
             self._min_tree[written] = leaves[written]
-        largest, place = state_dict["max_priority"]
-        if largest is not None:
-            self._max_priority = torch.tensor(largest, dtype=self.dtype, device="cpu"), place
+        self._largest = state_dict["max_priority"][0] or 1.0
         self.beta = state_dict["beta"]
 
 

@@ -33,6 +33,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
                 "flatten transitions with reshape(-1)"
             )
         super().register_storage(storage)
+        self.storage = storage
 
     def add(self, data: TensorDictBase) -> int:
         """Write one transition; return its index."""
@@ -51,7 +52,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         Raises:
             ConfigError: stored and new demonstrations exceed the capacity.
         """
-        storage, count = self._storage, len(data)
+        storage, count = self.storage, len(data)
         if len(storage) + count <= storage.max_size or keys.IS_DEMONSTRATION not in data:
             return super().extend(data)
         is_new = data[keys.IS_DEMONSTRATION].reshape(count, -1).any(1).cpu()
@@ -76,10 +77,6 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         index = torch.full((count,), -1, device="cpu")
         index[is_written] = places
         self._cursor = (int(places[-1]) + 1) % storage.max_size
-        self._write_count += len(places)
         data.set("index", index)
-        written = data[is_written] if excess else data
-        storage.set(places, written)
-        self._bump_generation(places, written)
-        self._mark_update_entities(places)
+        self.write_at(places, data[is_written] if excess else data)
         return index
