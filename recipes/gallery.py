@@ -31,7 +31,7 @@ from ba_torchrl.cli.types import (
     checked,
 )
 from ba_torchrl.core import keys
-from ba_torchrl.core.files import replaced
+from ba_torchrl.core.files import atomic_file
 from ba_torchrl.demonstrations.collect import expert_policy
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs.description import tasks_by_heading
@@ -171,7 +171,7 @@ def write_film(frames: Sequence[np.ndarray], milliseconds: float, path: Path) ->
     """Write images as a small WebP of the same duration with at most `MOST_FRAMES` images."""
     step = math.ceil(len(frames) / MOST_FRAMES)
     first, *others = (Image.fromarray(frame) for frame in frames[(len(frames) - 1) % step :: step])
-    with replaced(path) as scratch:
+    with atomic_file(path) as scratch:
         for quality in QUALITIES:
             first.save(
                 scratch,
@@ -226,7 +226,7 @@ def overview_of(strips: Mapping[str, Strip]) -> Image.Image:
 def write(picture: Image.Image, path: Path) -> Path:
     """Write a picture as a PNG with a palette."""
     small = picture.quantize(COLORS, kmeans=2, dither=Image.Dither.NONE)
-    with replaced(path) as scratch:
+    with atomic_file(path) as scratch:
         small.save(scratch, format="PNG", optimize=True)
     return path
 

@@ -22,7 +22,7 @@ from ba_torchrl.cli.types import (
     check_writable_file,
 )
 from ba_torchrl.core.config import LocalPath, Source
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from ba_torchrl.envs.settings import check_env
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
@@ -70,7 +70,7 @@ def main(settings: Settings) -> None:
     from ba_torchrl.demonstrations.episodes import is_success, mean_length, success_rate
 
     fields = {**settings.env, **source_config(source)}
-    with complete_only(settings.folder) as scratch:
+    with atomic_output(settings.folder) as scratch:
         with (
             settings.make_env(task, seed=seed, **fields) as env,
             progress_bar(total=settings.episodes, unit="episode") as bar,

@@ -15,7 +15,7 @@ from pydantic import Field
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, NewPath, Seed
 from ba_torchrl.commands.evaluate import PolicySettings
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from ba_torchrl.record.logging import progress_bar
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def main(settings: Settings) -> None:
     policy = load_policy(settings.policy, settings.which, settings.device)
     seeds = range(settings.seed, settings.seed + settings.episodes)
     folder = Path(settings.folder)
-    with complete_only(folder) as scratch:
+    with atomic_output(folder) as scratch:
         with (
             closing(policy.make_env(expert=True)) as env,
             progress_bar(total=settings.episodes, unit="episode") as bar,

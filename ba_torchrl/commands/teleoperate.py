@@ -15,7 +15,7 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, Fps, NewPath, TaskId
 from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from ba_torchrl.envs.settings import resolve_env
 
 
@@ -54,7 +54,7 @@ def main(settings: Settings) -> None:
 
     kept = []
     written = ExitStack()
-    scratch = written.enter_context(complete_only(Path(settings.path)))
+    scratch = written.enter_context(atomic_output(Path(settings.path)))
     env = make(resolved, seed=settings.seed)
     # after the lines that PyBullet writes when it opens the window
     print(f"keys in the window:\n{Keyboard(resolved.actions).help()}")

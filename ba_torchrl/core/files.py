@@ -1,10 +1,10 @@
 """Folders of data: tensors in safetensors files and values in JSON, with checksums.
 
-`seal` writes ``checksums.json``, with length and CRC-32 of every file of a folder; `check` compares
-the folder with it. No file of another type is opened, so that none can run code. Hidden files and
-texts are ignored, and links to files are followed.
+`write_checksums` writes ``checksums.json``, with length and CRC-32 of every file of a folder;
+`verify_checksums` compares the folder with it. No file of another type is opened, so that none can
+run code. Hidden files and texts are ignored, and links to files are followed.
 
-`replaced` and `complete_only` give a file or folder its name when it is complete on the disk.
+`atomic_file` and `atomic_output` give a file or folder its name when it is complete on the disk.
 `Lock` keeps other processes out, and `lock_holder` names the one inside (POSIX systems).
 """
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
     import torch
 
 OLD = ".old"
-"""Suffix of a folder that `complete_only` replaces."""
+"""Suffix of a folder that `atomic_output` replaces."""
 CHECKSUMS_FILE = "checksums.json"
 RENAMED = "the image with the key pixels is now depth in close loop, heightmap in open loop"
 """Why files of another format are refused."""
@@ -47,7 +47,7 @@ _CHUNK = 1 << 20
 _SETTLED_S = 2.0
 """Age of a file's last change from which another change has another time in the file system."""
 _SCRATCH = re.compile(r"\.\d+\.[0-9a-f]{6}\.")
-"""Begin of the names that `replaced` yields."""
+"""Begin of the names that `atomic_file` yields."""
 _NO_LOCKS = {errno.ENOLCK, errno.ENOSYS, errno.EOPNOTSUPP}
 """Of file systems of networks that are mounted without locks."""
 _UNNAMED = "another process"
@@ -65,13 +65,13 @@ def write_text(path: str | Path, text: str) -> Path:
         text: its content.
     """
     path = Path(path)
-    with naming(path), replaced(path) as scratch:
+    with errors_naming(path), atomic_file(path) as scratch:
         scratch.write_text(text, encoding="utf-8")
     return path
 
 
 @contextmanager
-def naming(path: Path) -> Iterator[None]:
+def errors_naming(path: Path) -> Iterator[None]:
     """Context whose errors of the system name a path, if they name none, as on a full disk."""
     try:
         yield
@@ -82,7 +82,7 @@ def naming(path: Path) -> Iterator[None]:
 
 
 @contextmanager
-def replaced(path: str | Path) -> Iterator[Path]:
+def atomic_file(path: str | Path) -> Iterator[Path]:
     """Yield a path with the same suffix, for a file that takes a name when it is complete.
 
     If the block raises, an older file of that name remains. A device is written to directly.
@@ -113,7 +113,7 @@ def remove_scratch(folder: Path) -> None:
             path.unlink()
 
 
-def seal(folder: str | Path) -> None:
+def write_checksums(folder: str | Path) -> None:
     """Write the checksums of a folder's files, and wait until all of them are on the disk.
 
     Raises:
@@ -121,14 +121,14 @@ def seal(folder: str | Path) -> None:
     """
     folder = Path(folder)
     (folder / CHECKSUMS_FILE).unlink(missing_ok=True)
-    files = {path.relative_to(folder).as_posix(): fingerprint(path) for path in _files(folder)}
+    files = {path.relative_to(folder).as_posix(): size_and_crc32(path) for path in _files(folder)}
     write_text(folder / CHECKSUMS_FILE, json.dumps({"crc32": files}, indent=1) + "\n")
     for path in [folder, *folder.rglob("*")]:
         _flush(path)
 
 
 @contextmanager
-def complete_only(path: Path, *, replace: bool = False) -> Iterator[Path]:
+def atomic_output(path: Path, *, replace: bool = False) -> Iterator[Path]:
     """Yield a path of the same name in a hidden folder, for a file or folder that is written there.
 
     When it is complete on the disk, it gets its place, after the files beside it. If the block
@@ -204,7 +204,7 @@ class Lock:
                 break
             self._file.close()
         try:
-            with naming(path):
+            with errors_naming(path):
                 self._file.truncate(0)
                 name = f"process {os.getpid()} on {socket.gethostname()}"
                 os.write(self._file.fileno(), name.encode())
@@ -238,8 +238,8 @@ def lock_holder(path: Path) -> str | None:
     return None
 
 
-def check(folder: str | Path) -> None:
-    """Check that a folder holds the files that `seal` found in it, unaltered.
+def verify_checksums(folder: str | Path) -> None:
+    """Check that a folder holds the files that `write_checksums` found in it, unaltered.
 
     Raises:
         DamagedFilesError: a file is missing, shorter, altered or not listed; or there are no
@@ -262,7 +262,7 @@ def check(folder: str | Path) -> None:
         reason = "is missing" if name in listed else f"is not listed in {CHECKSUMS_FILE}"
         raise DamagedFilesError(f"{folder / name} {reason}")
     for name, path in found.items():
-        size, checksum = fingerprint(path)
+        size, checksum = size_and_crc32(path)
         if size != listed[name][0]:
             raise DamagedFilesError(f"{path} has {size} bytes, {listed[name][0]} were written")
         if (size, checksum) != listed[name]:
@@ -280,7 +280,7 @@ def write_state(folder: str | Path, state: Mapping[str, Any]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     tensors: dict[str, torch.Tensor] = {}
     values = _encoded(state, tensors)
-    with naming(folder):
+    with errors_naming(folder):
         (folder / _VALUES_FILE).write_text(json.dumps(values) + "\n", encoding="utf-8")
     write_tensors(folder / _TENSORS_FILE, tensors)
 
@@ -396,18 +396,18 @@ def _files(folder: Path) -> Iterator[Path]:
             yield path
 
 
-def fingerprint(path: Path) -> tuple[int, int]:
+def size_and_crc32(path: Path) -> tuple[int, int]:
     """Return length and CRC-32 of a file; they are computed once while it is unchanged."""
     found = path.stat()
     if time.time() - found.st_ctime < _SETTLED_S:
-        return _fingerprint.__wrapped__(path, ())
+        return _size_and_crc32.__wrapped__(path, ())
     state = (found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
-    return _fingerprint(path.absolute(), state)
+    return _size_and_crc32(path.absolute(), state)
 
 
 @functools.lru_cache(maxsize=4096)
-def _fingerprint(path: Path, state: tuple[int, ...]) -> tuple[int, int]:
-    """Read a file for `fingerprint`; ``state`` changes with its content."""
+def _size_and_crc32(path: Path, state: tuple[int, ...]) -> tuple[int, int]:
+    """Read a file for `size_and_crc32`; ``state`` changes with its content."""
     size = checksum = 0
     with path.open("rb") as file:
         while chunk := file.read(_CHUNK):

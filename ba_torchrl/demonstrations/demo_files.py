@@ -17,11 +17,11 @@ from ba_torchrl import __version__
 from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import (
-    check,
-    complete_only,
+    atomic_output,
     read_json,
     read_state,
-    seal,
+    verify_checksums,
+    write_checksums,
     write_state,
     write_text,
 )
@@ -104,10 +104,10 @@ def save_demonstrations(
             "torchrl": torchrl.__version__,
         },
     }
-    with complete_only(path) as scratch:
+    with atomic_output(path) as scratch:
         write_state(scratch, {**entries, _LENGTHS: lengths})
         write_text(scratch / METADATA_FILE, json.dumps(metadata, indent=2) + "\n")
-        seal(scratch)
+        write_checksums(scratch)
 
 
 def load_demonstrations(
@@ -217,7 +217,7 @@ def read_metadata(path: Path) -> dict[str, Any]:
         metadata = read_json(path / METADATA_FILE)
     except (OSError, ValueError, RecursionError) as error:
         raise ConfigError(f"no demonstrations at {path}: {error}") from None
-    check(path)
+    verify_checksums(path)
     if isinstance(metadata, dict) and metadata.get("format") != _FORMAT:
         raise ConfigError(
             f"{path} has not the format {_FORMAT} of this version; collect the demonstrations again"

@@ -16,7 +16,7 @@ from matplotlib.figure import Figure  # no pyplot: it holds figures in a global 
 from matplotlib.lines import Line2D
 from numpy.typing import ArrayLike
 
-from ba_torchrl.core.files import replaced
+from ba_torchrl.core.files import atomic_file
 from ba_torchrl.record.summary import printable
 
 if TYPE_CHECKING:
@@ -148,7 +148,7 @@ def save(figure: Figure, path: Path) -> None:
     """Write a figure, to the same file for the same content."""
     metadata = {"Date": None} if path.suffix == ".svg" else None
     rcParams["svg.hashsalt"] = path.stem
-    with replaced(path) as scratch:
+    with atomic_file(path) as scratch:
         figure.savefig(scratch, metadata=metadata)
 
 

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from jinja2 import Environment, PackageLoader
 
-from ba_torchrl.core.files import replaced, write_text
+from ba_torchrl.core.files import atomic_file, write_text
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.results import CITABLE_EPISODES, file_of, now, why_unfinished
 from ba_torchrl.record.statistics import CONFIDENCE
@@ -174,7 +174,7 @@ def write_page(path: Path, **values: Any) -> Path:
 
 def write_csv(path: Path, rows: Sequence[Mapping[str, object]]) -> None:
     """Write rows with the same keys as a CSV file, which is safe to open in a spreadsheet."""
-    with replaced(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
+    with atomic_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]) if rows else [], lineterminator="\n")
         writer.writeheader()
         writer.writerows({key: _cell(value) for key, value in row.items()} for row in rows)
@@ -314,7 +314,7 @@ def _videos(section: Section, stem: str, folder: Path) -> list[dict[str, Any]]:
             source = file_of(run.folder, run.result, "video")
             if source is not None and source.suffix.lower() in VIDEO_SUFFIXES:
                 name = f"{names[group.task, group.method]}_seed{run.result.seed}{source.suffix}"
-                with replaced(folder / "videos" / stem / name) as scratch:
+                with atomic_file(folder / "videos" / stem / name) as scratch:
                     shutil.copyfile(source, scratch)
                 files[run.result.seed] = f"videos/{stem}/{name}"
         if files:

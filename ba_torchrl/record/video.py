@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ba_torchrl.core.files import replaced
+from ba_torchrl.core.files import atomic_file
 
 if TYPE_CHECKING:
     from ba_torchrl.envs.base import BulletArmEnv
@@ -109,7 +109,7 @@ def write_video(path: str | Path, frames: Sequence[np.ndarray], fps: float) -> P
             lines = done.stderr.decode(errors="replace").splitlines() or ["no reason given"]
             raise OSError(errno.EIO, f"ffmpeg: {lines[0].split('] ')[-1]}")
         film.seek(0)
-        with replaced(path) as scratch, scratch.open("wb") as file:
+        with atomic_file(path) as scratch, scratch.open("wb") as file:
             shutil.copyfileobj(film, file)
     return path
 

@@ -38,14 +38,14 @@ from ba_torchrl.core.files import (
     OLD,
     RENAMED,
     Lock,
-    check,
-    complete_only,
+    atomic_output,
+    errors_naming,
     lock_holder,
-    naming,
     read_json,
     read_state,
     remove_scratch,
-    seal,
+    verify_checksums,
+    write_checksums,
     write_state,
     write_text,
 )
@@ -211,9 +211,9 @@ class DurableCheckpoint(Checkpoint):
     def save(self, path: str | Path, **options: Any) -> Path:
         """Write a checkpoint; see TorchRL."""
         path = Path(path)
-        with naming(path), complete_only(path, replace=True) as scratch:
+        with errors_naming(path), atomic_output(path, replace=True) as scratch:
             super().save(scratch, **options)
-            seal(scratch)
+            write_checksums(scratch)
         return path
 
     def load(self, path: str | Path, **options: Any) -> CheckpointLoadResult:
@@ -224,7 +224,7 @@ class DurableCheckpoint(Checkpoint):
             ConfigError: a file is neither safetensors nor JSON, or its content does not fit the
                 components.
         """
-        check(path)
+        verify_checksums(path)
         try:
             return super().load(path, **options)
         except (CheckpointError, OSError, ValueError, KeyError, TypeError) as error:
@@ -282,7 +282,7 @@ def first_sound(paths: Iterable[Path]) -> Path | None:
     """
     for path in paths:
         try:
-            check(path)
+            verify_checksums(path)
         except DamagedFilesError as error:
             logger.warning("%s: passed over for the one before: %s", path.name, error)
         else:

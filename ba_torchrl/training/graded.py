@@ -22,7 +22,7 @@ from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner, SeedUse, derive_seed
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from ba_torchrl.demonstrations.collect import RandomActions, expert_policy
 from ba_torchrl.demonstrations.demo_files import (
     check_demonstrations,
@@ -123,7 +123,7 @@ class GradedSets:
             "medium": self._medium,
             "mixed": self._mixed,
         }
-        with complete_only(path) as scratch:
+        with atomic_output(path) as scratch:
             episodes, policy = made_by[grade](on_episode)
             save_demonstrations(
                 scratch,

@@ -29,7 +29,7 @@ from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import Interval, StrictModel, expanded, explain
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError, UnknownNameError, check_choice
-from ba_torchrl.core.files import complete_only, json_bytes, write_tensors, write_text
+from ba_torchrl.core.files import atomic_output, json_bytes, write_tensors, write_text
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
@@ -377,7 +377,7 @@ def save_policy(policy: TrainedPolicy, path: str | Path, test: TestedPolicy) -> 
     if policy.config.plugins:
         words.append(f"plugins=[{','.join(policy.config.plugins)}]")
     tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}
-    with complete_only(path, replace=True) as scratch:
+    with atomic_output(path, replace=True) as scratch:
         write_tensors(
             scratch,
             {

@@ -21,7 +21,7 @@ from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.cli.types import check_writable_file
 from ba_torchrl.core.config import StrictModel, parse, takes_path
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from tests.recipes import load_recipe, recipe
 
 RUN = {
@@ -96,7 +96,7 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.json").write_text(json.dumps(RUN))
     (tmp_path / "run/scalars.csv").write_text("step,name,value\n5,torn\n")
-    with complete_only(tmp_path / "held"), pytest.raises(SystemExit) as end:
+    with atomic_output(tmp_path / "held"), pytest.raises(SystemExit) as end:
         recipe(name, *REQUIRED.get(name, ()), override)
     error = capsys.readouterr().err
     assert end.value.code == EXIT_CODE

@@ -17,13 +17,13 @@ from ba_torchrl.core.errors import ConfigError, DamagedFilesError
 from ba_torchrl.core.files import (
     CHECKSUMS_FILE,
     Lock,
-    check,
-    complete_only,
+    atomic_file,
+    atomic_output,
     lock_holder,
     read_json,
     read_state,
-    replaced,
-    seal,
+    verify_checksums,
+    write_checksums,
     write_state,
     write_text,
 )
@@ -43,7 +43,7 @@ STATE = {
 def folder(tmp_path):
     path = tmp_path / "state"
     write_state(path / "part", STATE)
-    seal(path)
+    write_checksums(path)
     return path
 
 
@@ -52,7 +52,7 @@ def weights_of(folder):
 
 
 def test_a_state_is_read_as_it_was_written(folder):
-    check(folder)
+    verify_checksums(folder)
     state = read_state(folder / "part")
     assert torch.equal(state["weights"], STATE["weights"])
     assert state["empty"].shape == (0,)
@@ -123,14 +123,14 @@ def replaces_the_checksums(text):
 )
 def test_damage_is_found_and_named(folder, damage):
     with pytest.raises(DamagedFilesError, match=damage(folder)) as error:
-        check(folder)
+        verify_checksums(folder)
     assert "\n" not in str(error.value)
 
 
 @pytest.mark.parametrize("name", ["other.pickle", "state.pt", "prefetch.pkl", "state.tdz"])
 def test_files_that_a_library_would_unpickle_are_refused(folder, name):
     (folder / "part" / name).write_bytes(b"")
-    for opened in (check, seal):
+    for opened in (verify_checksums, write_checksums):
         with pytest.raises(ConfigError, match="is not opened"):
             opened(folder)
 
@@ -140,16 +140,16 @@ def test_checksums_are_computed_once_while_a_file_is_unchanged(folder, monkeypat
     crc32 = files.zlib.crc32
     monkeypatch.setattr(files.zlib, "crc32", lambda *args: computed.append(1) or crc32(*args))
     monkeypatch.setattr(files, "_SETTLED_S", 0)
-    check(folder)
+    verify_checksums(folder)
     first = len(computed)
-    check(folder)
+    verify_checksums(folder)
     assert len(computed) == first > 0
     file = weights_of(folder)
     content = file.read_bytes()
     file.unlink()
     file.write_bytes(content[::-1])
     with pytest.raises(DamagedFilesError, match="was altered"):
-        check(folder)
+        verify_checksums(folder)
 
 
 def test_a_full_disk_is_an_error_of_the_system(tmp_path, monkeypatch):
@@ -171,7 +171,7 @@ def test_other_values_are_no_state(tmp_path):
 def test_links_to_anything_but_files_are_refused(folder, target):
     (folder / "link.json").symlink_to(target)
     with pytest.raises(ConfigError, match="is not opened"):
-        check(folder)
+        verify_checksums(folder)
 
 
 def test_links_to_files_are_followed(folder, tmp_path):
@@ -179,12 +179,12 @@ def test_links_to_files_are_followed(folder, tmp_path):
     for number, path in enumerate(path for path in folder.rglob("*") if path.is_file()):
         path.rename(tmp_path / str(number))
         path.symlink_to(tmp_path / str(number))
-    check(folder)
+    verify_checksums(folder)
     assert torch.equal(read_state(folder / "part")["weights"], weights)
     tampered = weights_of(folder)
     tampered.write_bytes(tampered.read_bytes()[::-1])
     with pytest.raises(DamagedFilesError, match="its checksum differs"):
-        check(folder)
+        verify_checksums(folder)
 
 
 def test_hidden_files_and_texts_are_ignored(folder):
@@ -193,25 +193,25 @@ def test_hidden_files_and_texts_are_ignored(folder):
         path = folder / name
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"x")
-    check(folder)
-    seal(folder)
+    verify_checksums(folder)
+    write_checksums(folder)
     assert not set(names) & set(read_json(folder / CHECKSUMS_FILE)["crc32"])
 
 
 def test_json_may_have_a_byte_order_mark(folder):
     path = folder / CHECKSUMS_FILE
     path.write_text(path.read_text(), encoding="utf-8-sig")
-    check(folder)
+    verify_checksums(folder)
 
 
 def test_a_folder_may_replace_the_one_before(folder, tmp_path):
     for stop in (True, False):
-        with contextlib.suppress(KeyboardInterrupt), complete_only(folder, replace=True) as scratch:
+        with contextlib.suppress(KeyboardInterrupt), atomic_output(folder, replace=True) as scratch:
             write_state(scratch, {"step": 4})
-            seal(scratch)
+            write_checksums(scratch)
             if stop:
                 raise KeyboardInterrupt
-        check(folder)
+        verify_checksums(folder)
         assert (folder / "part").exists() == stop
         assert list(tmp_path.iterdir()) == [folder]
     assert read_state(folder) == {"step": 4}
@@ -222,7 +222,7 @@ def test_an_empty_folder_may_be_a_link(folder, tmp_path):
     link, target = tmp_path / "link", tmp_path / "disk" / "empty"
     target.mkdir(parents=True)
     link.symlink_to(target)
-    with complete_only(link) as scratch:
+    with atomic_output(link) as scratch:
         write_state(scratch, {"step": 4})
     assert link.is_symlink()
     assert read_state(target) == {"step": 4}
@@ -230,18 +230,31 @@ def test_an_empty_folder_may_be_a_link(folder, tmp_path):
     assert list(target.parent.iterdir()) == [target]
 
 
+def test_a_file_gets_its_place_after_the_files_beside_it(tmp_path, monkeypatch):
+    """A process that is killed in between leaves a card without its file, not a file without it."""
+    placed, replace = [], os.replace
+    monkeypatch.setattr(
+        files.os, "replace", lambda part, to: placed.append(to.name) or replace(part, to)
+    )
+    with atomic_output(tmp_path / "b.hdf5") as scratch:
+        for name in ("a.json", "b.hdf5", "b.hdf5.card.json"):
+            scratch.with_name(name).write_text("")
+    assert len(placed) == 3
+    assert placed[-1] == "b.hdf5"
+
+
 def test_a_second_writer_is_refused(tmp_path):
     path = tmp_path / "demos"
-    with complete_only(path) as scratch:
+    with atomic_output(path) as scratch:
         with (
             pytest.raises(
                 ConfigError, match=f"process {os.getpid()} on .* writes .*/demos; choose"
             ),
-            complete_only(path),
+            atomic_output(path),
         ):
             raise AssertionError("in the block")
         scratch.write_text("first")
-    with pytest.raises(ConfigError, match="exists already"), complete_only(path):
+    with pytest.raises(ConfigError, match="exists already"), atomic_output(path):
         raise AssertionError("in the block")
     assert list(tmp_path.iterdir()) == [path]
     assert path.read_text() == "first"
@@ -250,9 +263,9 @@ def test_a_second_writer_is_refused(tmp_path):
 _WRITER = """
 import os, signal
 from pathlib import Path
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 
-with complete_only(Path("demos")) as scratch:
+with atomic_output(Path("demos")) as scratch:
     scratch.write_text("half")
     os.kill(os.getpid(), signal.SIGKILL)
 """
@@ -262,7 +275,7 @@ def test_a_writer_that_was_killed_blocks_nobody(tmp_path):
     killed = run_script(tmp_path, _WRITER, check=False)
     assert killed.returncode == -signal.SIGKILL
     assert (tmp_path / ".demos.scratch/demos").exists()
-    with complete_only(tmp_path / "demos") as scratch:
+    with atomic_output(tmp_path / "demos") as scratch:
         assert not scratch.exists()
         scratch.write_text("whole")
     assert {path.name for path in tmp_path.iterdir()} == {"demos", "script.py", "stdout", "stderr"}
@@ -285,7 +298,7 @@ def test_a_file_system_without_locks_is_a_warning(code, is_usable, tmp_path, mon
 
     monkeypatch.setattr(files.fcntl, "flock", fails)
     stops = contextlib.nullcontext() if is_usable else pytest.raises(OSError, match="no lock")
-    with stops, complete_only(tmp_path / "demos") as scratch:
+    with stops, atomic_output(tmp_path / "demos") as scratch:
         scratch.write_text("whole")
     assert [path.name for path in tmp_path.iterdir()] == ["demos"] * is_usable
     (tmp_path / "lock").touch()
@@ -324,16 +337,16 @@ def test_a_file_is_replaced_when_it_is_complete(tmp_path):
     path, link = tmp_path / "new" / "film.mp4", tmp_path / "link.mp4"
     link.symlink_to(path)
     for content in ("old", "new"):
-        with replaced(link) as scratch:
+        with atomic_file(link) as scratch:
             assert scratch.suffix == path.suffix
             scratch.write_text(content)
-    with contextlib.suppress(OSError), replaced(path) as scratch:
+    with contextlib.suppress(OSError), atomic_file(path) as scratch:
         scratch.write_text("torn")
         raise OSError
     assert path.read_text() == "new"
     assert link.is_symlink()
     assert list(path.parent.iterdir()) == [path]
-    with replaced("/dev/null") as device:
+    with atomic_file("/dev/null") as device:
         assert str(device) == "/dev/null"
 
 

@@ -6,7 +6,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import read_state, seal, write_state
+from ba_torchrl.core.files import read_state, write_checksums, write_state
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations import demo_files
 from ba_torchrl.demonstrations.collect import (
@@ -94,7 +94,7 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     metadata = json.loads(file.read_text())
     assert metadata["env"].pop("object_type") == "cube"
     file.write_text(json.dumps(metadata))
-    seal(tmp_path)
+    write_checksums(tmp_path)
     assert len(load_demonstrations(tmp_path, task=TASK, env=ENV)) == len(episodes)
     with pytest.raises(ConfigError, match="object_type: collected with 'cube', needed 'cylinder'"):
         load_demonstrations(tmp_path, task=TASK, env={**ENV, "object_type": "cylinder"})
@@ -104,7 +104,7 @@ def test_a_field_that_was_added_later_has_its_default(collected, tmp_path):
     ):
         del metadata[name]
         file.write_text(json.dumps(metadata))
-        seal(tmp_path)
+        write_checksums(tmp_path)
         with pytest.raises(ConfigError, match=message):
             load_demonstrations(tmp_path, task=TASK, env=ENV)
 
@@ -138,7 +138,7 @@ def test_folders_with_other_tensors_are_refused(collected, tmp_path, changed):
     _, episodes = collected
     save_demonstrations(tmp_path / "demos", episodes, task=TASK, env=ENV, seed=0)
     write_state(tmp_path / "demos", {**read_state(tmp_path / "demos"), **changed})
-    seal(tmp_path / "demos")
+    write_checksums(tmp_path / "demos")
     with pytest.raises(ConfigError, match="does not hold episodes"):
         load_demonstrations(tmp_path / "demos", task=TASK, env=ENV)
 
@@ -166,7 +166,7 @@ def test_episodes_of_another_environment_are_not_saved(collected, tmp_path, task
 
 
 def test_a_folder_that_is_not_complete_is_removed(collected, tmp_path, monkeypatch):
-    monkeypatch.setattr(demo_files, "seal", lambda folder: 1 / 0)
+    monkeypatch.setattr(demo_files, "write_checksums", lambda folder: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         save_demonstrations(tmp_path / "demos", collected[1], task=TASK, env=ENV, seed=0)
     assert list(tmp_path.iterdir()) == []

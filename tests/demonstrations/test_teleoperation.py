@@ -17,7 +17,7 @@ from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
 from ba_torchrl.demonstrations.demo_files import read_demonstrations
 from ba_torchrl.demonstrations.episodes import is_success
@@ -228,7 +228,7 @@ def test_refusals(words, message, monkeypatch, tmp_path, capsys):
 def test_episodes_that_are_complete_are_kept(end, env, tmp_path, monkeypatch):
     def played(*_, **__):
         yield from record_demonstrations(env, toward_block(env), 1, seed=5, show=lambda _: None)
-        with pytest.raises(ConfigError, match=r"writes .*demos"), complete_only(tmp_path / "demos"):
+        with pytest.raises(ConfigError, match=r"writes .*demos"), atomic_output(tmp_path / "demos"):
             raise AssertionError("a second writer")
         raise end
 

@@ -10,7 +10,7 @@ import torch
 from hypothesis import strategies as st
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import CHECKSUMS_FILE, read_state, seal, write_state
+from ba_torchrl.core.files import CHECKSUMS_FILE, read_state, write_checksums, write_state
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
@@ -55,7 +55,7 @@ def run(tmp_path_factory):
 def state(tmp_path_factory):
     path = tmp_path_factory.mktemp("state") / "state"
     write_state(path, {"step": 3, "rows": [1, None, "text"], "pair": (0.5, torch.ones(2))})
-    seal(path)
+    write_checksums(path)
     return path
 
 
@@ -115,7 +115,7 @@ def altered(folder, sealed, read):
             try:
                 if reseal and chosen.name != CHECKSUMS_FILE:
                     for part in sealed(copy):
-                        seal(part)
+                        write_checksums(part)
                 read(copy)
             except ConfigError:
                 pass  # documented

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import CHECKSUMS_FILE, fingerprint, seal
+from ba_torchrl.core.files import CHECKSUMS_FILE, size_and_crc32, write_checksums
 from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
 from ba_torchrl.record.results import read_failure
 from ba_torchrl.training.checkpoint import (
@@ -84,7 +84,7 @@ def resume(folder):
 def reseal(folder):
     """Write checksums of every file, as somebody does who plants one."""
     files = {
-        path.relative_to(folder).as_posix(): fingerprint(path)
+        path.relative_to(folder).as_posix(): size_and_crc32(path)
         for path in folder.rglob("*")
         if path.is_file() and path.name != CHECKSUMS_FILE
     }
@@ -238,7 +238,7 @@ def test_files_nested_without_end_are_damaged(tmp_path):
 def test_a_sealed_manifest_of_another_form_is_refused(run, content):
     checkpoint = find_checkpoint(run, "latest")
     (checkpoint / "manifest.json").write_text(content)
-    seal(checkpoint)
+    write_checksums(checkpoint)
     with pytest.raises(ConfigError, match="does not fit this version"):
         load(run)
 
@@ -255,7 +255,7 @@ def test_a_checkpoint_of_another_version_is_refused(run, adapter, message):
     text = manifest.read_text()
     assert '"ba_torchrl.state.3"' in text
     manifest.write_text(text.replace("ba_torchrl.state.3", adapter))
-    seal(manifest.parent)
+    write_checksums(manifest.parent)
     with pytest.raises(ConfigError, match=message):
         load(run, "latest")
 

@@ -10,7 +10,7 @@ import torch
 from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.commands import graded as command
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import complete_only
+from ba_torchrl.core.files import atomic_output
 from ba_torchrl.demonstrations import load_demonstrations
 from ba_torchrl.demonstrations.demo_files import read_metadata
 from ba_torchrl.tasks.base import TASKS
@@ -54,7 +54,7 @@ def sets(folder):
 
 def test_a_set_that_another_process_makes_is_refused_before_it_plays(tmp_path, monkeypatch):
     monkeypatch.setattr(graded, "collect_episodes", None)
-    with complete_only(tmp_path / "random"), pytest.raises(ConfigError, match=r"writes .*random"):
+    with atomic_output(tmp_path / "random"), pytest.raises(ConfigError, match=r"writes .*random"):
         made(tmp_path)
 
 

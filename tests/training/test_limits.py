@@ -11,7 +11,7 @@ import torch
 import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.cli.errors import plain_errors
-from ba_torchrl.core.files import complete_only, write_tensors, write_text
+from ba_torchrl.core.files import atomic_output, write_tensors, write_text
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.video import write_video
 from tests.training.test_resume import config_for, interrupt, run
@@ -53,7 +53,7 @@ def noise(frames=6):
 
 
 def save_noise(path):
-    with complete_only(path, replace=True) as scratch:
+    with atomic_output(path, replace=True) as scratch:
         write_tensors(scratch, {"noise": torch.tensor(noise())})
 
 

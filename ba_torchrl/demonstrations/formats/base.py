@@ -24,9 +24,9 @@ from ba_torchrl.core.errors import (
     install_command,
 )
 from ba_torchrl.core.files import (
-    complete_only,
-    fingerprint,
+    atomic_output,
     json_bytes,
+    size_and_crc32,
     write_tensors,
     write_text,
 )
@@ -265,7 +265,7 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
             is_moved = form.channels_last and entry.is_image
             moved[entry.name] = np.moveaxis(values, 1, -1) if is_moved else values
         named.append(moved)
-    with complete_only(path) as scratch:
+    with atomic_output(path) as scratch:
         form.write(scratch, named, card)
         if not form.has_last_observation:
             observed = [
@@ -310,7 +310,7 @@ def read_card(path: Path) -> Card | None:
 def _checksums(path: Path) -> dict[str, tuple[int, int]]:
     """Return length and CRC-32 of the files of an export, by their paths below it."""
     files = [file for file in [path, *sorted(path.rglob("*"))] if file.is_file()]
-    return {file.relative_to(path).as_posix(): fingerprint(file) for file in files}
+    return {file.relative_to(path).as_posix(): size_and_crc32(file) for file in files}
 
 
 def check_files(path: Path, card: Card) -> None:
@@ -319,7 +319,7 @@ def check_files(path: Path, card: Card) -> None:
         file = path / name
         if not file.is_file():
             raise DamagedFilesError(f"{file} is missing")
-        if fingerprint(file) != (size, checksum):
+        if size_and_crc32(file) != (size, checksum):
             raise DamagedFilesError(
                 f"{file} was altered: {size} bytes were written, of another checksum; if it was on "
                 f"purpose, delete 'checksums' in {card_file(path)}"
