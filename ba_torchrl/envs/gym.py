@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -10,6 +11,8 @@ import gymnasium
 import numpy as np
 import torch
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from typing_extensions import Self
@@ -37,8 +40,8 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     ``info`` holds ``success``, ``fault``, ``step_count``, the conditions of success and, with
     ``expert=True``, ``expert_action``; ``is_success`` is ``success`` under the name that
     Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that the arm cannot execute;
-    ``instruction`` is the goal as a sentence, with ``observations=["instruction"]``. The values
-    are scalars and arrays of NumPy.
+    ``instruction`` is the goal as a sentence, with ``observations=["instruction"]``. Flags are
+    arrays of one bool without axes, which vectors of environments stack to arrays of bools.
 
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
@@ -71,6 +74,22 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             {key: space_of(spec) for key, spec in specs.items() if key not in INFO_KEYS}
         )
         self.action_space = space_of(self.torchrl_env.action_spec)
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """What ``gymnasium.make`` made it from, with the step limit of the environment."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        if value is not None and value.max_episode_steps is None:
+            value = dataclasses.replace(value, max_episode_steps=self._max_episode_steps)
+        self._spec = value
+
+    @property
+    def _max_episode_steps(self) -> int:
+        """The step limit, under the name of Gymnasium's `TimeLimit`, which scripts read."""
+        return self.torchrl_env.max_steps
 
     @property
     def instruction(self) -> str:
@@ -133,11 +152,24 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         values[keys.IS_OUT_OF_REACH] = self.torchrl_env.is_out_of_reach
         if keys.INSTRUCTION in state:
             values[keys.INSTRUCTION] = self.instruction
-        # NumPy's scalars: TorchRL's readers of infos take a `dtype` for granted, and read no text
-        info = {key: np.asarray(value)[()] for key, value in values.items()}
+        # TorchRL's readers of infos need a `dtype`, which Python's bools lack; vectors of Gymnasium
+        # stack arrays and Python's bools, not those of NumPy
+        arrays = {key: np.asarray(value) for key, value in values.items()}
+        info = {key: a if a.dtype == bool else a[()] for key, a in arrays.items()}
         if keys.EXPERT_ACTION in state:
             info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
         return observation, info
+
+
+class StateObservation(FlattenObservation):
+    """All observations of a `GymEnv` in one vector, in the order of its space's keys.
+
+    With poses these are ``holding`` as 0 or 1, then the numbers of ``observation``.
+    """
+
+    @property
+    def _max_episode_steps(self) -> int:
+        return self.env.get_wrapper_attr("_max_episode_steps")
 
 
 def space_of(spec: TensorSpec) -> spaces.Space:

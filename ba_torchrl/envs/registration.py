@@ -19,43 +19,61 @@ from ba_torchrl.core.registry import call_on_registration
 
 NAMESPACE = "BulletArm"
 ENTRY_POINT = "ba_torchrl.envs.gym:GymEnv"
+STATE_WRAPPER = "ba_torchrl.envs.gym:StateObservation"
+VARIANTS: dict[str, dict[str, Any]] = {
+    "": {},
+    "State": {"obs_type": "vec"},
+    "StateDense": {"obs_type": "vec", "reward": "dense"},
+}
+"""By the ending of an id's name, the keywords that its environments have by default."""
 
 
-def gym_id(task: str) -> str:
+def gym_id(task: str, variant: str = "") -> str:
     """Return Gymnasium's id of a registered task, which ends in its version.
 
     The id of ``close_loop/block_picking`` is ``BulletArm/CloseLoopBlockPicking-v0``, and that of
     ``mine/push_far``, a task from outside the package, is ``BulletArm/MinePushFar-v0``.
+
+    Args:
+        task: as listed by `ba_torchrl.list_tasks`.
+        variant: one of `VARIANTS`: ``State`` for ``BulletArm/CloseLoopBlockPicking-State-v0``.
     """
     from ba_torchrl.tasks.base import versions_of
 
     words = task.replace("/", "_").split("_")
     name = "".join(word.capitalize() for word in words)
-    return f"{NAMESPACE}/{name}-v{versions_of(task).task}"
+    ending = f"-{variant}" if variant else ""
+    return f"{NAMESPACE}/{name}{ending}-v{versions_of(task).task}"
 
 
 def register_task(task: str) -> None:
-    """Register a task with Gymnasium, if it is not registered yet, without importing torch.
+    """Register a task's `VARIANTS` with Gymnasium, unless they are there, without importing torch.
 
-    No step limit is registered, because the environment truncates the episode at ``max_steps`` of
-    its configuration. A task from outside the package is registered with its module, which the
-    processes of ``gymnasium.make_vec`` import.
+    A task without `progress` has no dense variant. No step limit is registered, because the
+    environment truncates the episode at ``max_steps`` of its configuration. A task from outside the
+    package is registered with its module, which the processes of ``gymnasium.make_vec`` import.
     """
-    from gymnasium.envs.registration import register, registry
+    from gymnasium.envs.registration import WrapperSpec, register, registry
 
-    from ba_torchrl.tasks.base import TASKS
+    from ba_torchrl.tasks.base import TASKS, Task
 
-    name = gym_id(task)
-    if name in registry:
-        other = registry[name].kwargs.get("task")
-        if other != task:
-            raise ValueError(f"the tasks {other!r} and {task!r} have the same Gymnasium id, {name}")
-        return
-    kwargs: dict[str, Any] = {"task": task}
     module = TASKS.plugin_module(task)
-    if module is not None and module not in MAIN:
-        kwargs["register_modules"] = (module,)
-    register(name, entry_point=ENTRY_POINT, kwargs=kwargs)
+    for variant, settings in VARIANTS.items():
+        if "reward" in settings and TASKS.entry(task).progress is Task.progress:
+            continue
+        name = gym_id(task, variant)
+        if name in registry:
+            other = registry[name].kwargs.get("task")
+            if other != task:
+                raise ValueError(
+                    f"the tasks {other!r} and {task!r} have the same Gymnasium id, {name}"
+                )
+            continue
+        kwargs: dict[str, Any] = {"task": task, **settings}
+        if module is not None and module not in MAIN:
+            kwargs["register_modules"] = (module,)
+        wrappers = (WrapperSpec("StateObservation", STATE_WRAPPER, {}),) if settings else ()
+        register(name, entry_point=ENTRY_POINT, additional_wrappers=wrappers, kwargs=kwargs)
 
 
 def register_tasks() -> None:

@@ -168,9 +168,36 @@ def test_types_are_numpy_or_python_types(make):
     assert type(info["expert_action"]) is np.ndarray
     observation, reward, terminated, truncated, info = env.step(NOTHING)
     assert [type(x) for x in (reward, terminated, truncated)] == [float, bool, bool]
-    assert {type(value) for value in info.values()} == {np.ndarray, np.bool_, np.int64}
+    assert {type(value) for value in info.values()} == {np.ndarray, np.int64}
     assert observation in env.observation_space
     assert "expert_action" not in make().reset()[1]
+
+
+@pytest.mark.parametrize("variant", ["State", "StateDense"])
+def test_a_state_is_one_box_that_torchrl_and_normalisers_take(variant):
+    name = gym_id("close_loop/block_reaching", variant)
+    env = gymnasium.make(name, seed=0, expert=True, max_steps=30)
+    poses = gymnasium.make(gym_id("close_loop/block_reaching"), obs_type="vec", seed=0)
+    (state, info), (expected, _) = env.reset(seed=1), poses.reset(seed=1)
+    assert env.observation_space == spaces.flatten_space(poses.observation_space)
+    assert state in env.observation_space
+    assert state.tolist() == [*expected["holding"], *expected["observation"]]
+    assert (env.spec.max_episode_steps, env._max_episode_steps) == (30, 30)
+    assert (0 < env.step(info["expert_action"])[1] < 1) == (variant == "StateDense")
+    env.close()
+    poses.close()
+    learner = torchrl.envs.GymEnv(name)
+    torchrl.envs.check_env_specs(learner)
+    assert set(learner.observation_spec.keys()) == {"observation"}
+    learner.close()
+
+
+def test_the_step_limit_is_that_of_the_environment(make):
+    assert make(max_steps=70).spec.max_episode_steps == 70
+    assert make(max_episode_steps=7).spec.max_episode_steps == 7
+    again = gymnasium.make(make(gym_id("close_loop/block_reaching", "State"), max_steps=9).spec)
+    assert (again.spec.max_episode_steps, again._max_episode_steps) == (9, 9)
+    again.close()
 
 
 def test_torchrl_registers_all_of_info():
@@ -280,6 +307,8 @@ def test_vectors_give_the_episodes_of_single_environments(make):
                 observation, _, _, _, info = env.step(action)
                 observations.append({key: value.copy() for key, value in observation.items()})
             assert info["step_count"].tolist() == [2, 2]
+            flags = ("success", "is_success", "fault", "is_grasped", "is_out_of_reach")
+            assert {info[key].dtype for key in flags} == {np.dtype(bool)}
         finally:
             env.close()
         for index in range(2):

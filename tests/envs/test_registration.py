@@ -10,7 +10,7 @@ import pytest
 
 import ba_torchrl
 from ba_torchrl.envs.registration import gym_id, register_tasks
-from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.tasks.base import TASKS, Task
 
 BUILT_IN = [task for task in TASKS if TASKS.plugin_module(task) is None]
 PICKING = "BulletArm/CloseLoopBlockPicking-v0"
@@ -33,12 +33,19 @@ def test_an_id_ends_in_the_version_of_the_task(monkeypatch):
     assert gym_id("close_loop/block_picking") == PICKING.replace("-v0", "-v2")
 
 
-def test_every_task_has_an_id_of_its_own():
+def ids(task):
+    """The ids of a task: images, states, and states with dense rewards if it has them."""
+    is_dense = TASKS[task].progress is not Task.progress
+    return [gym_id(task, variant) for variant in ("", "State", "StateDense")[: 2 + is_dense]]
+
+
+def test_every_task_has_ids_of_its_own():
     specs = {spec.id: spec for spec in gymnasium.registry.values() if spec.namespace == "BulletArm"}
-    assert {name: spec.kwargs["task"] for name, spec in specs.items()} == {
-        gym_id(task): task for task in ba_torchrl.list_tasks()
-    }
-    assert len(specs) == len(ba_torchrl.list_tasks())
+    expected = {name: task for task in ba_torchrl.list_tasks() for name in ids(task)}
+    assert {name: spec.kwargs["task"] for name, spec in specs.items()} == expected
+    assert "BulletArm/CloseLoopBlockReaching-StateDense-v0" in specs
+    assert "BulletArm/OpenLoopCovidTest-State-v0" in specs
+    assert "BulletArm/OpenLoopCovidTest-StateDense-v0" not in specs
     assert all(spec.max_episode_steps is None for spec in specs.values())
 
 
@@ -77,7 +84,7 @@ def test_ids_are_registered_in_any_import_order_and_without_torch(imports, tmp_p
         "print(json.dumps([known, sorted(sys.modules)]))",
         tmp_path,
     )
-    assert known == sorted(map(gym_id, BUILT_IN))
+    assert known == sorted(name for task in BUILT_IN for name in ids(task))
     assert not {"torch", "torchrl"} & set(loaded)
 
 
