@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator
 
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
+from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
@@ -24,11 +25,19 @@ def constant_weights() -> Iterator[None]:
         yield
 
 
+def acting_keys(policy: TensorDictModuleBase) -> list[NestedKey]:
+    """Return the entries of a policy's output that an environment needs: ``action``, and what the
+    policy carries to the next step."""
+    carried = [key for key in policy.out_keys if key[0] == keys.CARRIED]
+    return [keys.ACTION, *carried]
+
+
 class ActingPolicy(TensorDictModuleBase):
     """A policy on an environment's observations, which are transformed as in training.
 
-    It writes ``action`` and nothing else. It is in evaluation mode, also after ``train()``, and
-    shares the parameters and buffers of the given policy, whose mode does not change.
+    It writes ``action`` and what the policy carries to the next step, nothing else. It is in
+    evaluation mode, also after ``train()``, and shares the parameters and buffers of the given
+    policy, whose mode does not change.
 
     Args:
         policy: from the transformed observation to ``action``.
@@ -48,7 +57,7 @@ class ActingPolicy(TensorDictModuleBase):
         self.transforms = nn.ModuleList(transforms)
         self.exploration = exploration
         self.in_keys = list(policy.in_keys)
-        self.out_keys = [keys.ACTION]
+        self.out_keys = acting_keys(policy)
         self.eval()
 
     def train(self, mode: bool = True) -> Self:
@@ -58,9 +67,11 @@ class ActingPolicy(TensorDictModuleBase):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of a root TensorDict of any batch shape."""
         seen = tensordict.select(*self.in_keys)
+        if keys.CARRIED in tensordict:
+            seen.set(keys.CARRIED, tensordict[keys.CARRIED])
         for transform in self.transforms:
             seen = transform(seen)
         out = self.policy(seen)
         if self.exploration is not None and exploration_type() is ExplorationType.RANDOM:
             out = self.exploration(out)
-        return tensordict.set(keys.ACTION, out[keys.ACTION])
+        return tensordict.update(out.select(*self.out_keys))

@@ -7,6 +7,7 @@ from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
+from torch import Tensor
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
@@ -60,3 +61,21 @@ def as_transitions(
     if is_demonstration and imitates != "none" and not has_expert and keys.IS_EXPERT in flat:
         out[keys.IS_DEMONSTRATION] = flat[keys.IS_EXPERT].clone()
     return out
+
+
+def chunk_windows(actions: Tensor, is_known: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+    """Return the next actions from each step of an episode, and which of them count.
+
+    Args:
+        actions: of the steps of one episode, [N, A].
+        is_known: whether a step's action is to be imitated, [N]. From the first one that is not, a
+            chunk does not count.
+        horizon: number T of actions in a chunk.
+
+    Returns:
+        [N, T, A], with the episode's last action repeated beyond its end, and bool [N, T].
+    """
+    index = torch.arange(len(actions), device="cpu")[:, None] + torch.arange(horizon, device="cpu")
+    inside = index.clamp(max=len(actions) - 1)
+    is_valid = (index < len(actions)) & is_known[inside]
+    return actions[inside], is_valid.cumprod(dim=1).bool()

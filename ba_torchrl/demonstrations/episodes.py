@@ -14,6 +14,7 @@ from torchrl.envs.batched_envs import BatchedEnvBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.envs.carried import state_after
 from ba_torchrl.envs.checks import check_policy
 
 logger = logging.getLogger(__name__)
@@ -164,10 +165,13 @@ def play_seeds(
                 options[i] = {"seed": seeds[current[i][0]]}
             if state is not None:  # the first reset is of all environments
                 state.set("_reset", _mask(begins, num_envs))
+            carried = None if state is None else state.get(keys.CARRIED, None)
             state = env.reset(state, list_of_kwargs=options)
+            if carried is not None:
+                state.set(keys.CARRIED, carried)
         playing = [i for i, each in enumerate(current) if each is not None]
         step = env.step(policy(state).set("_step", _mask(playing, num_envs).squeeze(-1)))
-        state = step[keys.NEXT]
+        state = state_after(step)
         for i, transition in enumerate(_results(step).unbind(0)):
             if current[i] is None:
                 continue

@@ -19,6 +19,7 @@ from tensordict import NonTensorData, TensorDict, TensorDictBase
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.envs.base import BulletArmEnv
+from ba_torchrl.envs.carried import state_after
 from ba_torchrl.testing.episodes import expert_policy
 from ba_torchrl.testing.labels import OPENING, Offset, label_jumps, offset_of
 from ba_torchrl.testing.progress import Disturbed, SceneView
@@ -239,15 +240,15 @@ class _Examiner:
             if state[keys.DONE]:
                 return played, state
             jumps = label_jumps(env, played.saved[-1], self.rng)
-            action = self.policy(state.clone())[keys.ACTION]
-            label = state[keys.EXPERT_ACTION]
+            acted = self.policy(state.clone())
+            action, label = acted[keys.ACTION], state[keys.EXPERT_ACTION]
             policy, rounded = self._offsets(action, label)
             name = self._stage_name(bool(state[keys.HOLDING]))
             row = StateRow(seed, len(played.actions), name, policy, rounded, jumps)
             played.rows.append(row)
             played.actions.append(action.numpy())
             played.labels.append(label.numpy())
-            state = env.step(state.set(keys.ACTION, action))[keys.NEXT]
+            state = state_after(env.step(acted))
             if state[keys.FAULT]:
                 return played, state
 
@@ -329,7 +330,7 @@ class _Examiner:
         state, holding = self._restore(saved), []
         while len(holding) < (limit or self.env.max_steps):
             holding.append(bool(state[keys.HOLDING]))
-            state = self.env.step(policy(state))[keys.NEXT]
+            state = state_after(self.env.step(policy(state)))
             if state[keys.DONE]:
                 break
         return _Played(bool(state[keys.SUCCESS]), tuple(holding))

@@ -17,6 +17,7 @@ from ba_torchrl import make
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.core import keys
 from ba_torchrl.demonstrations.episodes import Policy, collect_episodes, mean_length, success_rate
+from ba_torchrl.envs.carried import state_after
 from ba_torchrl.envs.checks import check_policy
 from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.record.video import FrameRecorder
@@ -49,8 +50,8 @@ def acting_on(policy: TensorDictModuleBase, device: torch.device) -> Policy:
         return policy
 
     def act(tensordict: TensorDictBase) -> TensorDictBase:
-        observation = tensordict.select(*policy.in_keys).to(device)
-        return tensordict.set(keys.ACTION, policy(observation)[keys.ACTION].cpu())
+        seen = tensordict.select(*policy.in_keys, keys.CARRIED, strict=False).to(device)
+        return tensordict.update(policy(seen).select(*policy.out_keys).cpu())
 
     return act
 
@@ -113,7 +114,7 @@ def record_episodes(
                 recorder.record()
                 steps = 0
                 while not state[keys.DONE]:
-                    state = env.step(act(state))[keys.NEXT]
+                    state = state_after(env.step(act(state)))
                     steps += 1
                     recorder.record()
                 on_episode(number, steps, bool(state[keys.SUCCESS]))

@@ -8,7 +8,7 @@ from torchrl.envs import SerialEnv, TransformedEnv
 import ba_torchrl
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, SimulationError
-from ba_torchrl.data.transitions import as_transitions
+from ba_torchrl.data.transitions import as_transitions, chunk_windows
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.demonstrations.episodes import (
     RESULT_KEYS,
@@ -213,3 +213,11 @@ def test_a_restored_state_continues_the_episodes():
         assert values(assembler.complete(data)) == [([20, 21], True)]
     (one,), (other,) = (each.complete(rows((0, 2, True, False))) for each in (first, second))
     assert (one == other).all()
+
+
+def test_a_chunk_ends_with_its_episode_and_before_an_unknown_action():
+    actions = torch.arange(5.0)[:, None]
+    chunks, is_valid = chunk_windows(actions, torch.tensor([1, 1, 1, 0, 1]).bool(), 3)
+    rows = [[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 4], [4, 4, 4]]
+    assert chunks.squeeze(-1).tolist() == rows
+    assert is_valid.int().tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]]

@@ -75,11 +75,13 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
     Scaling keeps the direction, which clipping of the components does not.
 
     Args:
-        displacement: [B, 2].
+        displacement: [B, 2], or chunks [B, T, 2].
         angle_rad: [B] float64 on the CPU, radians.
     """
     _, *rotation = quarters_and_rotation(angle_rad)
     cos, sin = (to_device(x.to(displacement.dtype), displacement.device) for x in rotation)
+    if displacement.ndim == 3:
+        cos, sin = cos[:, None], sin[:, None]
     dx, dy = displacement.unbind(dim=-1)
     turned = torch.stack([cos * dx - sin * dy, sin * dx + cos * dy], dim=-1)
     return turned / turned.abs().amax(dim=-1, keepdim=True).clamp_min(1)
@@ -208,8 +210,8 @@ class SO2Augmentation(SeededTransform):
         """Return a copy of a batch of transitions [B] with some of them rotated.
 
         Args:
-            tensordict: holds the images, their successors, ``action`` and, if there is one,
-                ``target_action``.
+            tensordict: holds the images, their successors, ``action`` and, if they are there,
+                ``target_action`` and ``target_chunk``.
         """
         out = self._copied(tensordict)
         draws = torch.rand(
@@ -221,12 +223,15 @@ class SO2Augmentation(SeededTransform):
             return out
         for key in self._scene_images:
             map_pairs(out, key, chosen, lambda images: rotate_images(images, angle))
-        labels = [keys.TARGET_ACTION] if keys.TARGET_ACTION in tensordict else []
-        for key in [keys.ACTION, *labels]:
+        for key in (keys.ACTION, keys.TARGET_ACTION, keys.TARGET_CHUNK):
+            if key != keys.ACTION and key not in tensordict:
+                continue
             action = tensordict[key].clone()
-            rows = to_device(chosen, action.device)[:, None]
-            plane = to_device(torch.tensor(self._plane, device="cpu"), action.device)
-            action[rows, plane] = rotate_displacement(action[rows, plane], angle)
+            rows = to_device(chosen, action.device)
+            turned = action[rows]
+            plane = turned[..., self._plane]
+            turned[..., self._plane] = rotate_displacement(plane, angle)
+            action[rows] = turned
             out.set(key, action)
         return out
 

@@ -122,6 +122,7 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
     x, y = sequence.index("x"), sequence.index("y")
     data[keys.ACTION] *= 0.5  # short enough never to leave the box
     data[keys.TARGET_ACTION] = -data[keys.ACTION]
+    data[keys.TARGET_CHUNK] = torch.stack([data[keys.ACTION], -data[keys.ACTION] / 2], dim=1)
     before = data.clone()
     # Images that show their action: a spot at 0.6 (dx, dy), another at its opposite.
     for i in range(len(data)):
@@ -135,6 +136,9 @@ def test_one_angle_per_transition_for_all_three_entries(sequence):
     others = [i for i in range(len(sequence)) if i not in (x, y)]
     assert not moved[:, others].any()
     torch.testing.assert_close(out[keys.TARGET_ACTION], -out[keys.ACTION])
+    chunk = torch.stack([out[keys.ACTION], -out[keys.ACTION] / 2], dim=1)
+    torch.testing.assert_close(out[keys.TARGET_CHUNK][:, :, [x, y]], chunk[:, :, [x, y]])
+    assert torch.equal(out[keys.TARGET_CHUNK][:, :, others], data[keys.TARGET_CHUNK][:, :, others])
     assert (moved[:, [x, y]].sum(-1) > 1e-3).float().mean() > 0.9
     for i in range(len(data)):
         wanted = (0.6 * out[keys.ACTION][i, [x, y]]).tolist()
