@@ -35,11 +35,10 @@ def check_compiler(device: torch.device) -> None:
 def _has_cpp_compiler() -> bool:
     # a slow import, needed by compiled runs only
     from torch._inductor.cpp_builder import get_cpp_compiler
-    from torch._inductor.exc import InvalidCxxCompiler
 
     try:
         get_cpp_compiler()
-    except InvalidCxxCompiler:
+    except RuntimeError:
         return False
     return True
 

@@ -12,7 +12,6 @@ import torch
 from tensordict import NonTensorData, TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
-from torchrl.envs.utils import _classproperty
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
@@ -33,6 +32,20 @@ from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits
+
+
+class _OfClass:
+    """A property of a class and of its instances.
+
+    Args:
+        compute: from the class to the value.
+    """
+
+    def __init__(self, compute: Callable[[type], Any]) -> None:
+        self._compute = compute
+
+    def __get__(self, instance: object, owner: type) -> Any:
+        return self._compute(owner)
 
 
 class _MadeByTask(type(EnvBase)):
@@ -170,7 +183,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
 
     # -- public ------------------------------------------------------------------------------
 
-    @_classproperty
+    @_OfClass
     def available_envs(cls) -> list[str]:
         """Ids of all tasks, those of plugins included."""
         return list(TASKS)

@@ -84,7 +84,7 @@ class RecordedPosition:
     def __reduce__(self) -> tuple[Any, ...]:
         is_determined = self._played is not None or self._episodes.scene is None
         start = self.get_position() if is_determined else self._get_state()
-        attributes = {name: getattr(self, name) for name in ("_run_type_checks", "training")}
+        attributes = {name: getattr(self, name) for name in ("run_type_checks", "training")}
         if self._resumed is None:
             attributes["_resumed"] = None
         resolved = self.resolved.changed(render=False)

@@ -12,7 +12,7 @@ from tensordict import TensorDictBase
 from tensordict.utils import NestedKey
 from torch import Tensor
 from torchrl.objectives import ValueEstimators
-from torchrl.objectives.utils import dispatch_value_estimator
+from torchrl.objectives.utils import default_value_kwargs, dispatch_value_estimator
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
@@ -77,18 +77,18 @@ class TransitionLoss(ModalLoss):
         self.use_prioritized_weights = use_prioritized_weights
         self.reduction: Reduction = "mean" if reduction is None else reduction
         check_choice("reduction", self.reduction, Reduction)
-        self._in_keys: list[NestedKey] | None = None
+        self._needed_keys: list[NestedKey] | None = None
 
     @property
     def in_keys(self) -> list[NestedKey]:
         """Entries that ``forward`` needs, in the order of its arguments if called with tensors."""
-        if self._in_keys is None:
-            self._in_keys = self._required_keys()
-        return self._in_keys
+        if self._needed_keys is None:
+            self._needed_keys = self._required_keys()
+        return self._needed_keys
 
     @in_keys.setter
     def in_keys(self, values: Sequence[NestedKey]) -> None:
-        self._in_keys = list(values)
+        self._needed_keys = list(values)
 
     @abstractmethod
     def _required_keys(self) -> list[NestedKey]:
@@ -107,29 +107,25 @@ class TransitionLoss(ModalLoss):
         Raises:
             NotImplementedError: another of TorchRL's named estimators.
         """
-        value_type, settings = self._prepare_value_estimator_kwargs(value_type, **hyperparams)
-        if value_type is not None:
-            dispatch_value_estimator(
-                self,
-                value_type,
-                supported=(ValueEstimators.TD0,),
-                tensor_keys=self._value_estimator_keys(),
-                value_network=None,
-                **settings,
-            )
+        value_type = self.default_value_estimator if value_type is None else value_type
+        if not isinstance(value_type, ValueEstimators):
+            return super().make_value_estimator(value_type, **hyperparams)
+        self.value_type = value_type
+        names = ("value", "reward", "done", "terminated")
+        dispatch_value_estimator(
+            self,
+            value_type,
+            supported=(ValueEstimators.TD0,),
+            tensor_keys={name: getattr(self.tensor_keys, name) for name in names},
+            value_network=None,
+            **{**default_value_kwargs(value_type), **hyperparams},
+        )
         return self
 
     def _forward_value_estimator_keys(self, **kwargs: NestedKey) -> None:
         """Pass renamed keys to the value estimator and recompute `in_keys`."""
-        if self._value_estimator is not None:
-            self._value_estimator.set_keys(**self._value_estimator_keys())
-        self._in_keys = None
-
-    def _value_estimator_keys(self) -> dict[str, NestedKey]:
-        return {
-            name: getattr(self.tensor_keys, name)
-            for name in ("value", "reward", "done", "terminated")
-        }
+        super()._forward_value_estimator_keys(**kwargs)
+        self._needed_keys = None
 
     def _transition_keys(self, observation: list[NestedKey]) -> list[NestedKey]:
         """Return the keys of a transition: observation, action, reward and done flags."""

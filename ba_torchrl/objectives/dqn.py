@@ -183,7 +183,7 @@ class LevelDQNLoss(TransitionLoss):
         self.later_beta = later_beta
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         # Made before the first forward pass, because its gamma is part of the state_dict.
-        self.make_value_estimator(device=self._default_device)
+        self.make_value_estimator(device=next(self.parameters()).device)
 
     def _required_keys(self) -> list[NestedKey]:
         names = self._transition_keys(self.value_network.in_keys)

@@ -50,7 +50,7 @@ def with_buffers(updater: Updater) -> Updater:
         >>> updater = with_buffers(SoftUpdate(loss, tau=0.01))
     """
     sources, targets = updater._sources.copy(), updater._targets.copy()
-    for target_name in updater._target_names:
+    for target_name in list(targets.keys()):
         name = target_name.removeprefix("target_")
         online = getattr(updater.loss_module, name)
         target = getattr(updater.loss_module, target_name)

@@ -139,7 +139,7 @@ class SACfDLoss(TransitionLoss):
         self._shared = {key: encoder[id(p)] for key, p in actor if id(p) in encoder}
         """Keys of the parameters that the actor shares with the encoder, in both networks."""
         self._share_encoder()
-        device = self._default_device
+        device = next(self.parameters()).device
         self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
         self.register_coeff_buffer(
             "demonstration_weight", float(demonstration_weight), device=device
@@ -153,6 +153,7 @@ class SACfDLoss(TransitionLoss):
         self.contrastive = None if contrastive is None else contrastive.to(device)
         # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=device)
+        self.register_load_state_dict_post_hook(_reread_demonstration_weight)
 
     def _share_encoder(self) -> None:
         """Make shared parameters constants in the actor's terms, in the memory of the encoder's, so
@@ -176,12 +177,7 @@ class SACfDLoss(TransitionLoss):
         super().__setattr__(name, value)
         if name == "demonstration_weight":
             self._needs_demonstration_flag = bool(value != 0)
-            self._in_keys = None
-
-    def _load_from_state_dict(self, *args: Any) -> None:
-        """Restore the loss; whether it needs the flag follows from the saved behaviour weight."""
-        super()._load_from_state_dict(*args)
-        self.demonstration_weight = float(self.demonstration_weight)
+            self._needed_keys = None
 
     @property
     def alpha(self) -> Tensor:
@@ -397,6 +393,11 @@ class BilinearInfoNCE(nn.Module):
         similarities = anchors @ self.weight @ positives.mT
         labels = torch.arange(len(anchors), device=anchors.device)
         return F.cross_entropy(similarities, labels, reduction="none")
+
+
+def _reread_demonstration_weight(loss: SACfDLoss, _: object) -> None:
+    """Let a restored loss need the flag of demonstrations as its saved weight says."""
+    loss.demonstration_weight = float(loss.demonstration_weight)
 
 
 class SoftUpdateByNetwork(SoftUpdate):

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from tensordict.nn import TensorDictModule
 from torch import Tensor, nn
+from torch.distributions import Independent, Normal
 from torchrl.modules import ProbabilisticActor, TanhNormal, TruncatedNormal
 from torchrl.modules.distributions.continuous import SafeTanhTransform
 
@@ -25,9 +26,13 @@ class UnitTanhNormal(TanhNormal):
         self.non_trivial_min = self.non_trivial_max = False
         self.tanh_loc = False
         self.upscale = 5.0  # TorchRL's default, unused without tanh_loc
-        self._event_dims = min(1, loc.ndim)
-        self._t = SafeTanhTransform()
         self.update(loc, scale)
+
+    def update(self, loc: Tensor, scale: Tensor) -> None:
+        """Set location and scale [..., A]."""
+        self.loc, self.scale = loc, scale
+        base = Independent(Normal(loc, scale), min(1, loc.ndim))
+        super(TanhNormal, self).__init__(base, SafeTanhTransform())
 
 
 def squashed_gaussian_policy(actor: nn.Module, in_keys: Sequence[str]) -> ProbabilisticActor:

@@ -89,7 +89,9 @@ class RayCollection(WorkerCollection):
     def collect(self) -> TensorDict:
         """Send the weights and return a batch; see `WorkerCollection.collect`."""
         try:
-            return next(self._batches)
+            with warnings.catch_warnings():  # of weights that no scheme of TorchRL sends
+                warnings.filterwarnings("ignore", "RayCollector iteration started before weight")
+                return next(self._batches)
         except ray_module().exceptions.RayActorError as error:
             failures = self.problem.workers.max_restarts + 1
             raise failed_too_often(failures, error) from error
@@ -136,7 +138,6 @@ class _RestartingCollector(RayCollector):
             weight_sync_schemes={},
             update_after_each_batch=True,
         )
-        self._weight_sync_initialized = True
         for worker in range(config.workers):
             self.update_policy_weights_(worker_ids=worker)
 
