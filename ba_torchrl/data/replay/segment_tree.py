@@ -19,28 +19,34 @@ class SegmentTree:
     A binary heap in an array: node i has the children 2 i and 2 i + 1, and the leaves are the
     second half. Values are stored as float64, for sums over many leaves, and returned in ``dtype``.
 
+    As in TorchRL's native trees, the leaves are rounded up to the next power of two, and those
+    above ``size`` take values too: a prioritised buffer may hold more items than its sampler's
+    ``max_capacity``.
+
     Args:
-        capacity: number of leaves.
+        size: number of leaves that are asked for.
     """
 
     dtype = torch.float64
     reduce = np.add
     identity = 0.0
 
-    def __init__(self, capacity: int) -> None:
-        self.capacity = int(capacity)
-        self._leaves = 1 << max(0, self.capacity - 1).bit_length()
-        self._nodes = np.full(2 * self._leaves, self.identity)
+    def __init__(self, size: int) -> None:
+        self.size = int(size)
+        """Number of leaves that were asked for, of which a whole range consists."""
+        self.capacity = 1 << self.size.bit_length()
+        """Number of leaves: the least power of two above `size`."""
+        self._nodes = np.full(2 * self.capacity, self.identity)
 
     def __len__(self) -> int:
-        return self.capacity
+        return self.size
 
     def __getitem__(
         self, index: int | np.ndarray | torch.Tensor
     ) -> float | np.ndarray | torch.Tensor:
         if isinstance(index, int):
-            return float(self._nodes[self._leaves + index])
-        found = torch.as_tensor(self._nodes[self._leaves + np.asarray(index)], device="cpu")
+            return float(self._nodes[self.capacity + index])
+        found = torch.as_tensor(self._nodes[self.capacity + np.asarray(index)], device="cpu")
         found = found.to(self.dtype)
         return found.numpy() if isinstance(index, np.ndarray) else found
 
@@ -56,10 +62,10 @@ class SegmentTree:
         if node.min() < 0 or node.max() >= self.capacity:
             self._refuse_leaf()
         nodes = self._nodes
-        node = node + self._leaves
+        node = node + self.capacity
         nodes[node] = np.asarray(value, dtype=np.float64).reshape(-1)
-        if 8 * node.size > self._leaves:  # recomputing whole levels is faster than single paths
-            level = self._leaves
+        if 8 * node.size > self.capacity:  # recomputing whole levels is faster than single paths
+            level = self.capacity
             while level > 1:
                 nodes[level // 2 : level] = self.reduce(
                     nodes[level : 2 * level : 2], nodes[level + 1 : 2 * level : 2]
@@ -75,7 +81,7 @@ class SegmentTree:
         if not 0 <= index < self.capacity:
             self._refuse_leaf()
         nodes = self._nodes
-        node = index + self._leaves
+        node = index + self.capacity
         nodes[node] = value
         while node > 1:
             node >>= 1
@@ -89,13 +95,14 @@ class SegmentTree:
 
         Args:
             start: first leaf.
-            stop: one after the last leaf; at most the capacity counts.
+            stop: one after the last leaf. From ``start=0``, a stop of `size` or more means all
+                leaves.
         """
         nodes = self._nodes
-        if start <= 0 and stop >= self.capacity:
+        if start <= 0 and stop >= self.size:
             return float(nodes[1])
         result = self.identity
-        left, right = max(start, 0) + self._leaves, min(stop, self.capacity) + self._leaves
+        left, right = max(start, 0) + self.capacity, min(stop, self.capacity) + self.capacity
         while left < right:
             if left & 1:
                 result = self.reduce(result, nodes[left])
@@ -114,16 +121,17 @@ class SumTree(SegmentTree):
         """Return the first leaf whose inclusive prefix sum reaches ``mass``.
 
         Args:
-            mass: in [0, total]; for larger values the result is the last leaf, or the capacity.
+            mass: in [0, total]; for larger values the result is `size`.
         """
         rest = np.atleast_1d(np.asarray(mass, dtype=np.float64)).copy()
+        is_beyond = rest > self._nodes[1]
         node = np.ones(rest.shape, dtype=np.int64)
-        while node[0] < self._leaves:
+        while node[0] < self.capacity:
             left = self._nodes[2 * node]
             go_right = rest > left
             rest -= np.where(go_right, left, 0.0)
             node = 2 * node + go_right
-        leaf = np.minimum(node - self._leaves, self.capacity)
+        leaf = np.where(is_beyond, self.size, node - self.capacity)
         return int(leaf[0]) if np.ndim(mass) == 0 else torch.as_tensor(leaf, device="cpu")
 
 

@@ -69,13 +69,24 @@ def test_single_values_and_unset_leaves():
     assert total.query(0, 5) == smallest.query(0, 5) == 4
     assert smallest.query(0, 2) == np.inf
     assert total.scan_lower_bound(3.0) == 2
-    assert len(total) == 5
+    assert total.scan_lower_bound(9.0) == len(total) == total.size == 5
     clone = copy.deepcopy(total)
     total[2] = 1.0
     assert clone.query(0, 5) == 4
-    for index in (5, -1, torch.tensor([5])):
+    for index in (total.capacity, -1, torch.tensor([total.capacity])):
         with pytest.raises(IndexError):
             total[index] = 1.0
+
+
+def test_leaves_are_rounded_up_to_a_power_of_two_as_native_ones():
+    capacities = {size: segment_tree.SumTree(size).capacity for size in (1, 5, 7, 8)}
+    assert capacities == {1: 2, 5: 8, 7: 8, 8: 16}
+    sampler = PrioritizedSampler(5, alpha=1.0, beta=1.0)  # with fewer leaves than the storage
+    buffer = TensorDictReplayBuffer(
+        storage=LazyTensorStorage(8), sampler=sampler, batch_size=64, priority_key="priority"
+    )
+    buffer.extend(TensorDict({"x": torch.arange(8), "priority": torch.ones(8)}, [8]))
+    assert buffer.sample()["x"].unique().tolist() == list(range(8))
 
 
 def test_native_trees_are_kept(monkeypatch):
