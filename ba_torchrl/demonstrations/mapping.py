@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import TypeAdapter, ValidationError, field_validator
-from torchrl.data import NonTensor, TensorSpec
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from torchrl.data import NonTensor, TensorSpec, Unbounded
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import StrictModel
@@ -35,63 +35,58 @@ from ba_torchrl.envs.settings import ResolvedEnv
 logger = logging.getLogger(__name__)
 
 _NOT_OBSERVED = {*keys.STEP_FLAGS, keys.STEP_COUNT, keys.EXPERT_ACTION, keys.INSTRUCTION}
+_ONE_PER_ACTION = {keys.ACTION, *RESULTS}
+_RESULT = Unbounded((1,), device="cpu", dtype=torch.float64)
 _TOLERANCE = 1e-4
 """Part of a range by which values may exceed it, for rounding."""
+Number = Annotated[float, Field(strict=False)]
+"""A number, also as the text that YAML 1.1 makes of ``1e-3``."""
 
 
-class Source(StrictModel):
-    """Where the values of an entry come from."""
+class EntrySource(StrictModel):
+    """Where the values of an entry come from; a mapping may have the name alone."""
 
     source: str
     """Name in the file."""
     components: list[int] | None = None
     """Indices along the last axis, in their new order; None for all."""
-    scale: float | list[float] = 1.0
+    scale: Number | list[Number] = 1.0
     """Factor, of all components or of each."""
-    offset: float | list[float] = 0.0
+    offset: Number | list[Number] = 0.0
     """Added after scaling."""
 
-    @field_validator("scale", "offset", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _read_text(cls, given: Any) -> Any:
-        """Read ``1e-3``, which is text in YAML 1.1."""
-        if isinstance(given, list):
-            return [float(value) if isinstance(value, str) else value for value in given]
-        return float(given) if isinstance(given, str) else given
+    def _take_name(cls, given: Any) -> Any:
+        return {"source": given} if isinstance(given, str) else given
 
     def values(self, found: np.ndarray) -> np.ndarray:
         """Return the values of an entry of an episode, from those in the file."""
         try:
             if self.components is not None:
-                if found.ndim < 2:
-                    raise IndexError("has one number per step, no components")
-                last = found.shape[-1]  # NumPy does not check the indices of an array without rows
+                last = found.shape[-1] if found.ndim > 1 else 0
+                # NumPy does not check the indices of an array without rows
                 if out := [i for i in self.components if not -last <= i < last]:
-                    raise IndexError(f"components {out} are out of bounds")
+                    raise ValueError(f"components {out} are not among its {last}")
                 found = found[..., self.components]
             if self.scale == 1.0 and self.offset == 0.0:
                 return found
             return found * np.asarray(self.scale) + np.asarray(self.offset)
-        except (IndexError, ValueError, TypeError) as error:
+        except (ValueError, TypeError) as error:
             raise ConfigError(f"{self.source}, {found.shape}: {error}") from None
 
 
-_SOURCES = TypeAdapter(dict[str, Source])
+_SOURCES = TypeAdapter(dict[str, EntrySource])
 
 
-def _sources(mapping: str | Path | Mapping[str, Any]) -> dict[str, Source]:
+def _sources(mapping: str | Path | Mapping[str, Any]) -> dict[str, EntrySource]:
     """Return the source of each key, of a mapping that is given as a YAML file or as its values."""
-    what: Any = "mapping"
-    if not isinstance(mapping, Mapping):
-        what, mapping = mapping, _read_yaml(Path(mapping))
-    if not isinstance(mapping, Mapping) or not mapping:
-        raise ConfigError(f"{what}: must map keys to names in the file, got {mapping!r}")
-    given = {
-        str(key): {"source": value} if isinstance(value, str) else value
-        for key, value in mapping.items()
-    }
+    is_file = not isinstance(mapping, Mapping)
+    what, values = (mapping, _read_yaml(Path(mapping))) if is_file else ("mapping", mapping)
+    if not isinstance(values, Mapping):
+        raise ConfigError(f"{what}: must map keys to names in the file, got {values!r}")
     try:
-        return _SOURCES.validate_python(given)
+        return _SOURCES.validate_python(values)
     except ValidationError as error:
         first = error.errors()[0]
         raise ConfigError(f"{what}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
@@ -125,156 +120,128 @@ class MappedFile:
     ) -> None:
         self._form, self._path, self._resolved = form, path, resolved
         self._sources = _sources(mapping)
-        with opened(resolved) as env:
-            self._specs = _specs_of(env)
-            self._vectors, self._images = env.declared, env.images
+        with closing(make(resolved)) as env:
+            self._specs, self._vectors, self._images = entry_specs(env), env.declared, env.images
         self._is_sparse = resolved.config.reward == "sparse"
-        known = {*self._specs, *RESULTS, keys.INSTRUCTION}
-        if unknown := self._sources.keys() - known:
-            raise ConfigError(
-                f"{path}: the environment has no {', '.join(sorted(unknown))}. "
-                f"Known: {', '.join(sorted(known))}"
-            )
+        self._has_reward_only = keys.SUCCESS not in self._sources and keys.REWARD in self._sources
         needed = {*self._specs, *({keys.INSTRUCTION} & {*resolved.config.observations})}
-        if not self._is_sparse:
-            needed |= {keys.REWARD, keys.TERMINATED}
-        if missing := needed - self._sources.keys():
-            raise ConfigError(f"{path}: the mapping has no {', '.join(sorted(missing))}")
+        needed |= set() if self._is_sparse else {keys.REWARD, keys.TERMINATED}
+        known = {*self._specs, *RESULTS, keys.INSTRUCTION}
+        unknown, missing = self._sources.keys() - known, needed - self._sources.keys()
+        for owner, names in (("environment", unknown), ("mapping", missing)):
+            if names:
+                raise ConfigError(
+                    f"{path}: the {owner} has no {', '.join(sorted(names))}. "
+                    f"Known: {', '.join(sorted(known))}"
+                )
 
     def count(self) -> int:
         """Return the number of episodes, after the checks that need no values."""
-        return len(self._episodes(reads=False))
+        return len([*self._episodes(reads=False)])
 
     def read(self) -> list[Arrays]:
         """Return the entries of each episode until its first success or end."""
-        episodes = self._episodes(reads=True)
+        episodes = [*self._episodes(reads=True)]
         if not episodes:
             raise ConfigError(f"{self._path} holds no episodes")
-        self._warn_of_constants(episodes)
-        self._warn_of_zeros(episodes)
-        for message in contradictions(episodes, self._resolved):
+        for message in (*self._suspicious(episodes), *contradictions(episodes, self._resolved)):
             logger.warning("%s: %s", self._path, message)
-        if keys.REWARD in self._sources and keys.SUCCESS not in self._sources:
-            if not any(arrays[keys.REWARD].any() for arrays in episodes):
-                logger.warning(
-                    "%s: the rewards are all 0, and every episode counts as a success: map "
-                    "success, or leave out reward, which follows from it",
-                    self._path,
-                )
-            elif self._is_sparse:
-                for arrays in episodes:
-                    arrays[keys.SUCCESS] = arrays[keys.REWARD]
-        steps = _num_steps(episodes)
+        if self._is_sparse and self._has_reward_only and _has_rewards(episodes):
+            episodes = [{**each, keys.SUCCESS: each[keys.REWARD]} for each in episodes]
+        steps = sum(len(arrays[keys.ACTION]) for arrays in episodes)
         for number, arrays in enumerate(episodes):
             with naming_episode(self._path, number):
-                episodes[number] = with_results(_until_end(arrays), self._resolved)
-        if (left := _num_steps(episodes)) < steps:
+                episodes[number] = with_results(arrays, self._resolved)
+        if left_out := steps - sum(len(arrays[keys.ACTION]) for arrays in episodes):
             logger.warning(
                 "%s: %d of %d steps are left out, those after the first success or end of an "
                 "episode",
                 self._path,
-                steps - left,
+                left_out,
                 steps,
             )
         return episodes
 
-    def _episodes(self, *, reads: bool) -> list[Arrays]:
-        """Return the mapped entries of each episode; see `_entries`."""
-        episodes = []
-        for number, stored in enumerate(read_file(self._form, self._path)):
-            with naming_episode(self._path, number):
-                entries = self._entries(stored, reads=False)  # before any value is read
-                episodes.append(self._entries(stored, reads=True) if reads else entries)
-        return episodes
-
-    def _entries(self, stored: StoredArrays, *, reads: bool) -> Arrays:
-        """Return the mapped entries of an episode with the types and shapes of the environment.
+    def _episodes(self, *, reads: bool) -> Iterator[Arrays]:
+        """Yield the mapped entries of each episode with the types and shapes of the environment.
 
         Args:
-            reads: False to check shapes only; the returned arrays have no rows.
+            reads: False to check shapes only; the arrays have no rows.
         """
+        for number, stored in enumerate(read_file(self._form, self._path)):
+            with naming_episode(self._path, number):
+                arrays = self._entries(stored, reads=False)  # before any value is read
+                yield self._entries(stored, reads=True) if reads else arrays
+
+    def _entries(self, stored: StoredArrays, *, reads: bool) -> Arrays:
         arrays, rows = {}, {}
         for key, source in self._sources.items():
             try:
                 found = entry_of(stored, source.source)
-                shape = found.shape
+                rows[key] = sum(found.shape[:1])
                 if not reads:
-                    found = plain(np.empty((0, *shape[1:]), found.dtype))
-                values = source.values(np.asarray(found))
-                if key in self._specs:
-                    values = _fitted(values, self._specs[key])
-                    if key in self._vectors:
-                        values = self._vectors[key].fitted(values)
-                elif key in RESULTS:
-                    values = _one_number(values)
-                    if key != keys.REWARD or self._is_sparse:
-                        _check_zero_or_one(values)
-                elif values.dtype.kind not in "US":
-                    raise ConfigError("is no text")
-                arrays[key], rows[key] = values, sum((values.shape if reads else shape)[:1])
+                    found = plain(np.empty((0, *found.shape[1:]), found.dtype))
+                arrays[key] = self._fitted(key, source.values(np.asarray(found)))
             except ConfigError as error:
                 raise ConfigError(f"{key}: {error}") from None
         steps = rows[keys.ACTION]
         for key in arrays.keys() - {keys.INSTRUCTION}:
-            name, is_result = self._sources[key].source, key in RESULTS
-            if is_result and rows[key] == steps + 1 and self._form.has_row_before_first_step(name):
+            has_first = self._form.has_row_before_first_step(self._sources[key].source)
+            if key in RESULTS and rows[key] == steps + 1 and has_first:
                 arrays[key], rows[key] = arrays[key][1:], steps
-            check_rows(key, rows[key], steps, not is_result and key != keys.ACTION)
+            check_rows(key, rows[key], steps, key not in _ONE_PER_ACTION)
         if not steps:
             raise ConfigError("there are no actions")
         return arrays
 
-    def _warn_of_constants(self, episodes: Sequence[Arrays]) -> None:
-        """Warn of an action or an observation that is one number in the whole file."""
-        for key, spec in self._specs.items():
-            first = episodes[0][key].flat[0]
-            if spec.dtype == torch.bool or key == keys.IN_HAND:  # which are often 0
-                continue
-            if all((arrays[key] == first).all() for arrays in episodes):
-                logger.warning(
-                    "%s: %s is %g in all steps; is it the right entry?", self._path, key, first
-                )
+    def _fitted(self, key: str, values: np.ndarray) -> np.ndarray:
+        """Return the values of an entry as the environment, or the step's result, has them."""
+        if key == keys.INSTRUCTION:
+            if values.dtype.kind not in "US":
+                raise ConfigError("is no text")
+            return values
+        values = _fitted(values, self._specs.get(key, _RESULT))
+        if key in self._vectors:
+            return self._vectors[key].fitted(values)
+        is_flag = key in RESULTS and (key != keys.REWARD or self._is_sparse)
+        if is_flag and (np.minimum(abs(values), abs(values - 1.0)) > _TOLERANCE).any():
+            raise ConfigError(
+                f"has values from {values.min():g} to {values.max():g}, needed 0 or 1; set scale "
+                "and offset, or another source"
+            )
+        return values
 
-    def _warn_of_zeros(self, episodes: Sequence[Arrays]) -> None:
-        """Warn of more zeros than the environment's images have, and of points at the origin."""
-        for key in self._specs:
-            most = self._images[key].max_zeros if key in self._images else 1.0
-            is_points = key == keys.POINT_CLOUD
-            if most >= 1 and not is_points:
+    def _suspicious(self, episodes: Sequence[Arrays]) -> Iterator[str]:
+        """Yield sentences on entries that are one number in the whole file, and on more zeros than
+        the environment's images have, points at the origin included."""
+        for key, spec in self._specs.items():
+            first, is_points = episodes[0][key].flat[0], key == keys.POINT_CLOUD
+            is_flag = spec.dtype == torch.bool or key == keys.IN_HAND  # which are often 0
+            if not is_flag and all((arrays[key] == first).all() for arrays in episodes):
+                yield f"{key} is {first:g} in all steps; is it the right entry?"
+            most = self._images[key].max_zeros if key in self._images else float(not is_points)
+            if most >= 1:
                 continue
-            most, zeros, count = 0.0 if is_points else most, 0, 0
+            zeros, count = 0, 0
             for arrays in episodes:  # one at a time, since the images may fill the memory
                 is_zero = arrays[key] == 0
                 is_zero = is_zero.all(-1) if is_points else is_zero
                 zeros, count = zeros + is_zero.sum(), count + is_zero.size
-            if (share := zeros / count) > most:
-                logger.warning(
-                    "%s: %.0f %% of %s is 0 m, which cameras write where they measure nothing; the "
-                    "environment has at most %.0f %%. Fill in these values",
-                    self._path,
-                    100 * share,
-                    key,
-                    100 * most,
+            if zeros > most * count:
+                yield (
+                    f"{100 * zeros / count:.0f} % of {key} is 0 m, which cameras write where they "
+                    f"measure nothing; the environment has at most {100 * most:.0f} %. Fill in "
+                    "these values"
                 )
+        if self._has_reward_only and not _has_rewards(episodes):
+            yield (
+                "the rewards are all 0, and every episode counts as a success: map success, or "
+                "leave out reward, which follows from it"
+            )
 
 
-def entry_specs(resolved: ResolvedEnv) -> dict[str, TensorSpec]:
+def entry_specs(env: BulletArmEnv) -> dict[str, TensorSpec]:
     """Return the specifications of an environment's observations and actions, by key."""
-    with opened(resolved) as env:
-        return _specs_of(env)
-
-
-@contextmanager
-def opened(resolved: ResolvedEnv) -> Iterator[BulletArmEnv]:
-    """Make an environment, and close it."""
-    env = make(resolved)
-    try:
-        yield env
-    finally:
-        env.close()
-
-
-def _specs_of(env: BulletArmEnv) -> dict[str, TensorSpec]:
     specs = {
         key: spec
         for key, spec in env.observation_spec.items()
@@ -283,8 +250,8 @@ def _specs_of(env: BulletArmEnv) -> dict[str, TensorSpec]:
     return {**specs, keys.ACTION: env.action_spec}
 
 
-def _num_steps(episodes: Sequence[Arrays]) -> int:
-    return sum(len(arrays[keys.ACTION]) for arrays in episodes)
+def _has_rewards(episodes: Sequence[Arrays]) -> bool:
+    return any(arrays[keys.REWARD].any() for arrays in episodes)
 
 
 def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
@@ -302,9 +269,12 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
     if values.shape[1:] != shape and len(shape) == 3 == values.ndim - 1:
         values = np.moveaxis(values, -1, 1)
     if values.shape[1:] != shape:
-        raise ConfigError(f"has the shape {list(values.shape[1:])}, needed {list(shape)}")
+        hint = "; set components" if len(shape) == 1 else ""
+        raise ConfigError(f"has the shape {list(values.shape[1:])}, needed {list(shape)}{hint}")
     if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
-        raise ConfigError("has values that are no finite numbers")
+        raise ConfigError(
+            "has values that are no finite numbers; set components, or another source"
+        )
     if spec.dtype == torch.bool:
         return values if values.dtype == bool else values > 0.5
     low, high = (getattr(spec.space, name, None) for name in ("low", "high"))
@@ -324,71 +294,39 @@ def _fitted(values: np.ndarray, spec: TensorSpec) -> np.ndarray:
     return values.astype(torch.empty(0, dtype=spec.dtype, device="cpu").numpy().dtype, copy=False)
 
 
-def _one_number(values: np.ndarray) -> np.ndarray:
-    """Return results of the steps as [T, 1]."""
-    if values.dtype.kind not in "fiub" or not np.isfinite(values).all():
-        raise ConfigError(
-            "has values that are no finite numbers; needed one number per step: set components, "
-            "or another source"
-        )
-    if not values.ndim or values.shape[1:] not in ((), (1,)):
-        raise ConfigError(
-            f"has the shape {list(values.shape[1:])}, needed one number per step; set components"
-        )
-    return values.reshape(-1, 1)
-
-
-def _check_zero_or_one(values: np.ndarray) -> None:
-    """Check that results are 0 or 1, but for rounding."""
-    if (np.minimum(abs(values), abs(values - 1.0)) > _TOLERANCE).any():
-        raise ConfigError(
-            f"has values from {values.min():g} to {values.max():g}, needed 0 or 1; set scale and "
-            "offset, or another source"
-        )
-
-
-def _until_end(arrays: Arrays) -> Arrays:
-    """Return an episode until its first step with a success or an end."""
-    steps = len(arrays[keys.ACTION])
+def with_results(arrays: Arrays, resolved: ResolvedEnv) -> Arrays:
+    """Return an episode until its first success or end, with the results of its steps, which its
+    file may lack."""
     marks = [arrays[key] > 0.5 for key in RESULTS if key in arrays and key != keys.REWARD]
     ends = np.flatnonzero(np.any(marks, axis=0)) if marks else ()
-    if not len(ends):
-        return arrays
-    steps = int(ends[0]) + 1
-    kept = {key: steps + (key not in (*RESULTS, keys.ACTION)) for key in arrays}
-    return {
-        key: values if key == keys.INSTRUCTION else values[: kept[key]]
+    steps = int(ends[0]) + 1 if len(ends) else len(arrays[keys.ACTION])
+    out = {
+        key: values[: steps + (key not in _ONE_PER_ACTION)]
         for key, values in arrays.items()
+        if key != keys.INSTRUCTION
     }
-
-
-def with_results(arrays: Arrays, resolved: ResolvedEnv) -> Arrays:
-    """Return an episode with the results of its steps, which its file may lack."""
-    reward_kind = resolved.config.reward
-    steps = len(arrays[keys.ACTION])
     is_last = np.arange(steps)[:, None] == steps - 1
 
     def flags(key: str, default: np.ndarray) -> np.ndarray:
-        return arrays[key] > 0.5 if key in arrays else default
+        return out[key] > 0.5 if key in out else default
 
     success = flags(keys.SUCCESS, is_last)
     ends_at_limit = is_last & resolved.task_class.terminates_at_limit
     terminated = flags(keys.TERMINATED, success | ends_at_limit)
-    if reward_kind == "sparse" or (reward_kind == "difference" and keys.SUCCESS in arrays):
+    reward_kind = resolved.config.reward
+    if reward_kind == "sparse" or (reward_kind == "difference" and keys.SUCCESS in out):
         terminated = terminated | success
-    ends = is_last & ~terminated  # also where the file marks no end
-    truncated = flags(keys.TRUNCATED, ends) | ends
-    reward = np.asarray(arrays.get(keys.REWARD, success), dtype=np.float32)
-    if reward_kind == "sparse" and keys.SUCCESS in arrays:
+    unmarked = is_last & ~terminated  # also where the file marks no end
+    truncated = flags(keys.TRUNCATED, unmarked) | unmarked
+    reward = np.asarray(out.get(keys.REWARD, success), dtype=np.float32)
+    if reward_kind == "sparse" and keys.SUCCESS in out:
         reward = reward.round()
-        if (reward != success).any():
-            step = int(np.flatnonzero(reward != success)[0])
+        if len(wrong := np.flatnonzero(reward != success)):
             raise ConfigError(
-                f"step {step} of {steps} has the reward {reward[step].item():g} and the success "
-                f"{int(success[step].item())}; leave out reward, which follows from success"
+                f"step {wrong[0]} of {steps} has the reward {reward[wrong[0], 0]:g} and the "
+                f"success {int(success[wrong[0], 0])}; leave out reward, which follows from success"
             )
-    results = (reward, terminated, truncated, success)
-    out = arrays | dict(zip(RESULTS, results, strict=True))
+    out |= dict(zip(RESULTS, (reward, terminated, truncated, success), strict=True))
     if keys.INSTRUCTION in arrays:
         texts = {*arrays[keys.INSTRUCTION].astype(str).reshape(-1).tolist()}
         if len(texts) != 1 or not all(texts):
@@ -396,5 +334,5 @@ def with_results(arrays: Arrays, resolved: ResolvedEnv) -> Arrays:
                 f"instruction: found {sorted(texts)[:3]}, needed one sentence that remains the "
                 "same in an episode"
             )
-        out[keys.INSTRUCTION] = np.array([*texts] * (steps + 1))
+        out[keys.INSTRUCTION] = np.array([*texts])
     return out
