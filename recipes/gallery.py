@@ -32,9 +32,9 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.core import keys
 from ba_torchrl.core.files import atomic_file
-from ba_torchrl.demonstrations.collect import expert_policy
 from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs.description import tasks_by_heading
+from ba_torchrl.envs.policies import expert_policy
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.video import FrameRecorder
 from ba_torchrl.tasks.structures.open_loop import check_has_structure

@@ -30,7 +30,7 @@ from ba_torchrl.cli.types import EnvSettings, OutputFolder, TaskId, Tasks, check
 from ba_torchrl.core import keys
 from ba_torchrl.core.files import read_json, write_text
 from ba_torchrl.core.plugins import load_plugins
-from ba_torchrl.demonstrations.collect import expert_policy
+from ba_torchrl.envs.policies import expert_policy
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.sim.world import count_clients

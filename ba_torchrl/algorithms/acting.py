@@ -14,7 +14,7 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.evaluation_mode import evaluated, evaluation_copy
+from ba_torchrl.core.evaluation_mode import evaluation_copy, set_evaluation_mode
 from ba_torchrl.modules.steerable.layers import reuse_filters
 
 
@@ -62,7 +62,7 @@ class ActingPolicy(TensorDictModuleBase):
 
     def train(self, mode: bool = True) -> Self:
         """Stay in evaluation mode."""
-        return evaluated(self)
+        return set_evaluation_mode(self)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write the action of a root TensorDict of any batch shape."""

@@ -36,7 +36,7 @@ from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
-from ba_torchrl.objectives.networks import with_buffers
+from ba_torchrl.objectives.networks import with_buffer_updates
 
 __all__ = [
     "ALGORITHMS",
@@ -102,7 +102,7 @@ class Learner(ABC):
         self.stages = self.make_stages()
         self.first_losses = self.make_first_losses()
         updater = self.make_target_updater()
-        self.target_updater = None if updater is None else with_buffers(updater)
+        self.target_updater = None if updater is None else with_buffer_updates(updater)
         self.replay = self.make_replay()
         for transform in self.make_transforms():
             self.replay.append_transform(transform)

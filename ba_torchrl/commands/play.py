@@ -19,7 +19,7 @@ from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
-    from ba_torchrl.demonstrations.episodes import Policy
+    from ba_torchrl.envs.policies import Policy
 
 
 class Settings(EnvSettings):
@@ -67,7 +67,7 @@ def _print_episode(number: int, steps: int, is_success: bool) -> None:
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
     """Return the environment and the policy that acts, None for random actions."""
     from ba_torchrl import load_policy
-    from ba_torchrl.demonstrations.collect import expert_policy
+    from ba_torchrl.envs.policies import expert_policy
 
     is_loaded = settings.policy not in ("expert", "random")
     if settings.task is None and (not is_loaded or settings.policy == "trained"):

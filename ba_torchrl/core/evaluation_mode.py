@@ -31,10 +31,10 @@ def evaluation_copy(network: Network) -> Network:
     """
     params = (part for part in network.modules() if isinstance(part, TensorDictParams))
     kept = (*network.parameters(), *network.buffers(), *params)
-    return evaluated(copy.deepcopy(network, {id(each): each for each in kept}))
+    return set_evaluation_mode(copy.deepcopy(network, {id(each): each for each in kept}))
 
 
-def evaluated(network: Network) -> Network:
+def set_evaluation_mode(network: Network) -> Network:
     """Set a network to evaluation mode and return it.
 
     Convolutions of escnn stay in training mode, which changes nothing but that they expand their
@@ -43,5 +43,5 @@ def evaluated(network: Network) -> Network:
     if not hasattr(network, "expand_parameters"):
         network.training = False
         for child in network.children():
-            evaluated(child)
+            set_evaluation_mode(child)
     return network

@@ -7,15 +7,12 @@ from typing import TYPE_CHECKING
 from ba_torchrl.core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from ba_torchrl.demonstrations.collect import (
-        collect_demonstrations,
-        expert_policy,
-        expert_scores,
-    )
+    from ba_torchrl.demonstrations.collect import collect_demonstrations, expert_scores
     from ba_torchrl.demonstrations.dataset import BulletArmExperienceReplay
     from ba_torchrl.demonstrations.demo_files import load_demonstrations, save_demonstrations
     from ba_torchrl.demonstrations.episodes import collect_episodes, mean_length, success_rate
     from ba_torchrl.demonstrations.exchange import export_demonstrations
+    from ba_torchrl.envs.policies import expert_policy
 
 _MODULES = {
     "BulletArmExperienceReplay": "dataset",

@@ -23,15 +23,9 @@ from ba_torchrl.demonstrations.time_reversal import (
     reverse_episode,
 )
 from ba_torchrl.envs.factory import make, make_vector_env
+from ba_torchrl.envs.policies import expert_policy
 
 SOURCES: tuple[Source, ...] = get_args(Source)
-
-
-def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
-    """Copy the expert's action; the environment must be made with ``expert=True``."""
-    if keys.EXPERT_ACTION not in tensordict:
-        raise ConfigError("there is no expert's action: make the environment with expert=True")
-    return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION].clone())
 
 
 def collect_demonstrations(

@@ -27,7 +27,7 @@ from ba_torchrl.core.files import (
 )
 from ba_torchrl.demonstrations.episodes import mean_return, success_rate
 from ba_torchrl.demonstrations.exchange import (
-    check_entries,
+    check_episodes,
     check_same_environment,
     count_demonstrations,
     env_values,
@@ -78,7 +78,7 @@ def save_demonstrations(
     path = Path(expanded(path))
     if path.exists() and any(path.iterdir()):
         raise FileExistsError(f"{path} is not empty; choose another folder")
-    check_entries(episodes, task, env)
+    check_episodes(episodes, task, env)
     lengths = torch.tensor([len(episode) for episode in episodes], device="cpu")
     steps = torch.cat(list(episodes)).flatten_keys(_SEPARATOR)
     entries: dict[str, Any] = {}

@@ -16,10 +16,10 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.carried import state_after
 from ba_torchrl.envs.checks import check_policy
+from ba_torchrl.envs.policies import Policy
 
 logger = logging.getLogger(__name__)
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
 
 RESULT_KEYS = (keys.REWARD, keys.SUCCESS, keys.FAULT, keys.TERMINATED, keys.TRUNCATED, keys.DONE)
 """Entries of a step that hold the result of an episode."""

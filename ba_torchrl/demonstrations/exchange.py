@@ -6,6 +6,7 @@ import functools
 import json
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import closing
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -86,7 +87,7 @@ def export_demonstrations(
         raise ValueError("there are no episodes to export")
     if form.suffixes and path.suffix.lower() not in form.suffixes:
         raise ConfigError(f"{path} could not be read back; end the path in {form.suffixes[0]}")
-    check_entries(episodes, task, env)
+    check_episodes(episodes, task, env)
     roles = _roles(episodes[0])
     arrays = [_to_arrays(episode, roles) for episode in episodes]
     entries = {key: _entry(key, role, arrays[0][key]) for key, role in roles.items()}
@@ -126,10 +127,11 @@ def export_demonstrations(
     write_file(form, path, arrays, card)
 
 
-def check_entries(episodes: Sequence[TensorDictBase], task: str, env: dict[str, Any]) -> None:
+def check_episodes(episodes: Sequence[TensorDictBase], task: str, env: dict[str, Any]) -> None:
     """Raise `ConfigError` unless all episodes [T] have the entries of the first, and of the
     environment those and the shapes of its observations and actions."""
-    specs = entry_specs(resolve_env(task, env))
+    with closing(make(task, **env)) as made:
+        specs = entry_specs(made)
     roles = _roles(episodes[0])
     for number, episode in enumerate(episodes):
         if missing := {*roles, *specs} - set(_roles(episode)):
@@ -147,12 +149,9 @@ def check_entries(episodes: Sequence[TensorDictBase], task: str, env: dict[str, 
 
 def _instruction(task: str, env: dict[str, Any]) -> str:
     """Return the goal as a sentence: the example of `describe`, with these parameters."""
-    made = make(task, **{**env, "seed": 0})
-    try:
+    with closing(make(task, **{**env, "seed": 0})) as made:
         made.reset()
         return made.instruction
-    finally:
-        made.close()
 
 
 def import_demonstrations(

@@ -58,7 +58,7 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
 
     @classmethod
     def make_actions(cls, config: EnvConfig) -> CloseLoopActions:
-        """Return the action space; see `Control`."""
+        """Return the action space; see `ControlEnv`."""
         return CloseLoopActions(config.action_sequence, config.dpos, config.drot)
 
     @property

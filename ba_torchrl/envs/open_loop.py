@@ -60,7 +60,7 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
 
     @classmethod
     def make_actions(cls, config: EnvConfig) -> OpenLoopActions:
-        """Return the action space; see `Control`."""
+        """Return the action space; see `ControlEnv`."""
         x, y, _ = config.workspace
         if not math.isclose(x[1] - x[0], y[1] - y[0], rel_tol=1e-6):
             raise ConfigError("workspace: an open-loop task needs a square one, x as wide as y")

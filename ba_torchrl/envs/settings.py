@@ -18,7 +18,7 @@ from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 
-class Control(Protocol):
+class ControlEnv(Protocol):
     """What the class of environments of a control declares besides `BulletArmEnv`."""
 
     default_action_sequence: ClassVar[str]
@@ -33,7 +33,7 @@ class Control(Protocol):
         """Return the action space."""
 
 
-CONTROLS: Registry[type[Control]] = Registry("kind of control", "ba_torchrl.envs")
+CONTROLS: Registry[type[ControlEnv]] = Registry("kind of control", "ba_torchrl.envs")
 
 
 @dataclass(frozen=True)

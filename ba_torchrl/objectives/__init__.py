@@ -2,7 +2,7 @@
 
 from ba_torchrl.objectives.dqn import LevelDQNLoss, SingleLevelValues
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
-from ba_torchrl.objectives.networks import with_buffers
+from ba_torchrl.objectives.networks import with_buffer_updates
 from ba_torchrl.objectives.rlpd import RLPDLoss
 from ba_torchrl.objectives.sacfd import SACfDLoss
 
@@ -13,5 +13,5 @@ __all__ = [
     "RLPDLoss",
     "SACfDLoss",
     "SingleLevelValues",
-    "with_buffers",
+    "with_buffer_updates",
 ]

@@ -18,7 +18,7 @@ class ModalIQLLoss(IQLLoss, ModalLoss):
     Arguments and values are those of `torchrl.objectives.IQLLoss`.
     """
 
-    evaluated_qvalue_network: TensorDictModule
+    qvalue_network_in_evaluation_mode: TensorDictModule
     target_actor_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
@@ -41,14 +41,14 @@ class ModalIQLLoss(IQLLoss, ModalLoss):
         """Compute target values with the copy of the critics in evaluation mode."""
         super()._make_vmap()
         self._trained_values, network = self._vmap_qvalue_networkN0, self.qvalue_network
-        self.__dict__["qvalue_network"] = self.evaluated_qvalue_network
+        self.__dict__["qvalue_network"] = self.qvalue_network_in_evaluation_mode
         super()._make_vmap()
-        self._evaluated_values = self._vmap_qvalue_networkN0
+        self._untrained_values = self._vmap_qvalue_networkN0
         self.__dict__["qvalue_network"] = network
         self._vmap_qvalue_networkN0 = self._values  # a method, which a copy of the loss has as well
 
     def _values(self, tensordict: TensorDictBase, params: TensorDictBase) -> TensorDictBase:
         """Return the observation and actions with the values of all critics, [critics, ...]."""
         is_trained = torch.is_grad_enabled() and params is self.qvalue_network_params
-        compute = self._trained_values if is_trained else self._evaluated_values
+        compute = self._trained_values if is_trained else self._untrained_values
         return compute(tensordict, params)

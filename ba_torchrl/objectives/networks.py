@@ -26,14 +26,16 @@ class ModalLoss(LossModule):
     ) -> None:
         """Convert a network as TorchRL does, and keep a copy in evaluation mode as well."""
         super().convert_to_functional(module, module_name, *args, **kwargs)
-        self.__dict__[f"evaluated_{module_name}"] = evaluation_copy(self.__dict__[module_name])
+        self.__dict__[f"{module_name}_in_evaluation_mode"] = evaluation_copy(
+            self.__dict__[module_name]
+        )
 
     def network(self, name: str) -> Any:
         """Return a network, in evaluation mode if gradients are disabled."""
-        return self.__dict__[name if torch.is_grad_enabled() else f"evaluated_{name}"]
+        return self.__dict__[name if torch.is_grad_enabled() else f"{name}_in_evaluation_mode"]
 
 
-def with_buffers(updater: Updater) -> Updater:
+def with_buffer_updates(updater: Updater) -> Updater:
     """Let a target updater of TorchRL move buffers as it moves parameters; return it.
 
     TorchRL's updaters leave out buffers, such as the statistics of a batch norm, which a target
@@ -44,10 +46,10 @@ def with_buffers(updater: Updater) -> Updater:
         >>> import torch
         >>> from torchrl.modules import QValueActor
         >>> from torchrl.objectives import SoftUpdate
-        >>> from ba_torchrl.objectives import LevelDQNLoss, with_buffers
+        >>> from ba_torchrl.objectives import LevelDQNLoss, with_buffer_updates
         >>> network = torch.nn.Sequential(torch.nn.BatchNorm1d(3), torch.nn.Linear(3, 2))
         >>> loss = LevelDQNLoss(QValueActor(network, action_space="categorical"))
-        >>> updater = with_buffers(SoftUpdate(loss, tau=0.01))
+        >>> updater = with_buffer_updates(SoftUpdate(loss, tau=0.01))
     """
     sources, targets = updater._sources.copy(), updater._targets.copy()
     for target_name in list(targets.keys()):

@@ -20,11 +20,10 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.carried import state_after
-from ba_torchrl.testing.episodes import expert_policy
+from ba_torchrl.envs.policies import Policy, expert_policy
 from ba_torchrl.testing.labels import OPENING, Offset, label_jumps, offset_of
 from ba_torchrl.testing.progress import Disturbed, SceneView
 
-Policy = Callable[[TensorDictBase], TensorDictBase]
 Rounding = Callable[[torch.Tensor], torch.Tensor]
 
 PIXELS = 256

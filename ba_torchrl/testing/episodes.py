@@ -40,11 +40,6 @@ def continues(task: str) -> bool:
     return TASKS[task].continues is not Task.continues
 
 
-def expert_policy(tensordict: TensorDictBase) -> TensorDictBase:
-    """Copy the expert's action. TorchRL requires the name of the argument."""
-    return tensordict.set(keys.ACTION, tensordict[keys.EXPERT_ACTION])
-
-
 def play_expert(env: BulletArmEnv, episodes: int, *, noise: float = 0.0) -> list[TensorDict]:
     """Return episodes [T] of the expert.
 

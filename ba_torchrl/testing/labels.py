@@ -16,9 +16,10 @@ from tensordict import TensorDictBase
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.envs.base import BulletArmEnv
+from ba_torchrl.envs.policies import expert_policy
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.geometry import euler_matrix, quaternion_product, tool_rotation
-from ba_torchrl.testing.episodes import MAX_EPISODE_STEPS, expert_policy, make_small
+from ba_torchrl.testing.episodes import MAX_EPISODE_STEPS, make_small
 
 LAST_BITS = 1e-6
 """Largest change of a coordinate, metres, and of an angle, radians, that no image shows."""

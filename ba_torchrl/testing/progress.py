@@ -12,13 +12,14 @@ from tensordict import TensorDictBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.envs.base import BulletArmEnv
+from ba_torchrl.envs.policies import expert_policy
 from ba_torchrl.envs.scene import Scene
 from ba_torchrl.sim.bodies import Body, vertical_extent
 from ba_torchrl.sim.geometry import Quaternion, yaw_quaternion
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.manipulation.clearance import passing_height_m
 from ba_torchrl.tasks.manipulation.footprints import narrowest, outline
-from ba_torchrl.testing.episodes import action_at, expert_policy, make_small, random_actions
+from ba_torchrl.testing.episodes import action_at, make_small, random_actions
 
 MAX_STEPS = 60
 """Step limit of the disturbed episodes, which need more steps than others."""

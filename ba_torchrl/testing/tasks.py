@@ -10,7 +10,6 @@ import functools
 import math
 import pickle
 import warnings
-from collections.abc import Callable
 from contextlib import closing
 from typing import Any, NamedTuple
 
@@ -22,12 +21,12 @@ from torchrl.envs.utils import check_env_specs
 from ba_torchrl import make_vector_env
 from ba_torchrl.core import keys
 from ba_torchrl.envs.base import BulletArmEnv
+from ba_torchrl.envs.policies import Policy, expert_policy
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.testing.episodes import (
     MAX_EPISODE_STEPS,
     action_at,
     continues,
-    expert_policy,
     image_of,
     make_small,
     play_expert,
@@ -35,8 +34,6 @@ from ba_torchrl.testing.episodes import (
 )
 from ba_torchrl.testing.labels import label_jump_share
 from ba_torchrl.testing.progress import check_progress
-
-Policy = Callable[[TensorDictBase], TensorDictBase]
 
 POLICY_NOISE = 0.1
 """Standard deviation of the actions of a learned policy, as a share of the range of a component."""

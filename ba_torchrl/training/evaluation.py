@@ -16,9 +16,10 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl import make
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.core import keys
-from ba_torchrl.demonstrations.episodes import Policy, collect_episodes, mean_length, success_rate
+from ba_torchrl.demonstrations.episodes import collect_episodes, mean_length, success_rate
 from ba_torchrl.envs.carried import state_after
 from ba_torchrl.envs.checks import check_policy
+from ba_torchrl.envs.policies import Policy
 from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.record.video import FrameRecorder
 

@@ -23,15 +23,16 @@ from ba_torchrl.algorithms.base import Learner, SeedUse, derive_seed
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import atomic_output
-from ba_torchrl.demonstrations.collect import RandomActions, expert_policy
+from ba_torchrl.demonstrations.collect import RandomActions
 from ba_torchrl.demonstrations.demo_files import (
     check_demonstrations,
     load_demonstrations,
     read_metadata,
     save_demonstrations,
 )
-from ba_torchrl.demonstrations.episodes import Policy, collect_episodes, quotas
+from ba_torchrl.demonstrations.episodes import collect_episodes, quotas
 from ba_torchrl.envs.factory import make_vector_env
+from ba_torchrl.envs.policies import Policy, expert_policy
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training.config import ExperimentConfig

@@ -12,7 +12,7 @@ from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.errors import MissingPackageError, install_command
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.demonstrations.demo_files import recorded_expert
-from ba_torchrl.demonstrations.episodes import Policy
+from ba_torchrl.envs.policies import Policy
 from ba_torchrl.record.results import (
     CurvePoint,
     RunResult,

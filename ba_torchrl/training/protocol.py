@@ -18,8 +18,9 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.core.config import FIRST_TEST_SEED
 from ba_torchrl.core.config import PROTOCOL as PROTOCOL
-from ba_torchrl.demonstrations.episodes import Policy, is_success, play_seeds
+from ba_torchrl.demonstrations.episodes import is_success, play_seeds
 from ba_torchrl.envs.checks import check_policy
+from ba_torchrl.envs.policies import Policy
 from ba_torchrl.record.results import TestedPolicy
 
 TEST_EPISODES = 500

@@ -30,7 +30,7 @@ from ba_torchrl.modules import (
     evaluation_copy,
     squashed_gaussian_policy,
 )
-from ba_torchrl.objectives import SACfDLoss, with_buffers
+from ba_torchrl.objectives import SACfDLoss, with_buffer_updates
 
 
 def main(
@@ -87,7 +87,7 @@ def main(
         optim_steps_per_batch=1,
         loss_module=loss,
         optimizer=torch.optim.Adam(loss.parameters(), lr=3e-4),
-        target_net_updater=with_buffers(SoftUpdate(loss, tau=0.05)),
+        target_net_updater=with_buffer_updates(SoftUpdate(loss, tau=0.05)),
         replay_buffer=replay,
         log_rewards=False,  # would need TorchRL's RewardSum(out_keys=["reward_sum"])
         checkpoint=None if checkpoint is None else Checkpoint(),

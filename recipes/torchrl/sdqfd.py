@@ -27,7 +27,7 @@ from ba_torchrl.modules import (
     evaluation_copy,
     spatial_policy,
 )
-from ba_torchrl.objectives import LevelDQNLoss, with_buffers
+from ba_torchrl.objectives import LevelDQNLoss, with_buffer_updates
 
 
 def main(
@@ -67,7 +67,7 @@ def main(
     loss.make_value_estimator(gamma=0.9)
     optimizer = torch.optim.Adam(loss.parameters(), lr=3e-4, weight_decay=1e-5)
     # copies at every 25th update
-    target_updater = with_buffers(HardUpdate(loss, value_network_update_interval=24))
+    target_updater = with_buffer_updates(HardUpdate(loss, value_network_update_interval=24))
 
     replay = make_replay("symmetric", 100_000, batch_size, codecs=make_codecs(images), seed=seed)
     for episode in collect_demonstrations(

@@ -216,7 +216,7 @@ def test_renamed_keys():
     other = data.clone()
     for old, new in renames.items():
         other.rename_key_(old, new)
-    for critic in (renamed.qvalue_network, renamed.evaluated_qvalue_network):
+    for critic in (renamed.qvalue_network, renamed.qvalue_network_in_evaluation_mode):
         critic.in_keys[1] = "act"
     renamed.set_keys(
         action="act",

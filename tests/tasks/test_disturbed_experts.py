@@ -5,6 +5,7 @@ import pytest
 import torch
 
 from ba_torchrl.core import keys
+from ba_torchrl.envs.policies import expert_policy
 from ba_torchrl.sim.contacts import contacts, vertical_force_n
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.kuka import Kuka
@@ -12,7 +13,6 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.manipulation.footprints import outline
 from ba_torchrl.tasks.manipulation.primitives import grasped_body
-from ba_torchrl.testing.episodes import expert_policy
 from ba_torchrl.testing.progress import close_around_object
 from tests.tasks.episodes import play, slow
 

@@ -15,7 +15,6 @@ from ba_torchrl.tasks.base import TASKS, CloseLoopTask
 from ba_torchrl.tasks.clutter.base import ClutterTask
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M
 from ba_torchrl.tasks.clutter.push_planner import NEAR_M, Push, PushPlanner
-from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.manipulation.primitives import (
     ALIGNED_M,
     CLOSED,
@@ -28,6 +27,7 @@ from ba_torchrl.tasks.manipulation.primitives import (
     move_toward,
 )
 from ba_torchrl.tasks.manipulation.progress_terms import lift_height, reach, staged
+from ba_torchrl.tasks.manipulation.top_down_grasps import TopDownGrasp
 
 RISK_ALLOWED_WITHOUT_YAW = 1.0
 """Largest risk score of a grasp of a gripper that cannot turn and has few grasps; with only riskier

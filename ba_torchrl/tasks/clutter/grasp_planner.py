@@ -15,8 +15,8 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.vision.depth import HeightCamera
-from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.manipulation.primitives import nearest_equivalent_yaw
+from ba_torchrl.tasks.manipulation.top_down_grasps import TopDownGrasp
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 SIDE_GAP_M = 0.007

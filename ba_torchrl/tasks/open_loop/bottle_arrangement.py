@@ -18,9 +18,9 @@ from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
 from ba_torchrl.tasks.manipulation.clearance import half_gap_m
 from ba_torchrl.tasks.manipulation.footprints import Rectangle
-from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.manipulation.hand_clearance import outline_clearances_m
 from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, pick_command
+from ba_torchrl.tasks.manipulation.top_down_grasps import TopDownGrasp
 from ba_torchrl.tasks.packing.base import FILLING_ORDERS, RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 from ba_torchrl.tasks.structures.blueprint import UPRIGHT_RAD

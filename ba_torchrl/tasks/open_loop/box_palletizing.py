@@ -18,7 +18,6 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.manipulation.pick_place_commands import (
     LEVEL_RAD,
     no_op,
@@ -27,6 +26,7 @@ from ba_torchrl.tasks.manipulation.pick_place_commands import (
     place_command,
     swaps_fingers,
 )
+from ba_torchrl.tasks.manipulation.top_down_grasps import is_reachable
 from ba_torchrl.tasks.packing.base import (
     FILLING_ORDERS,
     RELEASE_GAP_M,

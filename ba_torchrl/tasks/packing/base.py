@@ -19,9 +19,9 @@ from ba_torchrl.tasks.base import OpenLoopTask
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.manipulation.clearance import half_gap_m
 from ba_torchrl.tasks.manipulation.footprints import Rectangle, gaps_m, narrowest, outline
-from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
 from ba_torchrl.tasks.manipulation.hand_clearance import hand_rectangle, outline_clearances_m
 from ba_torchrl.tasks.manipulation.pick_place_commands import place_command
+from ba_torchrl.tasks.manipulation.top_down_grasps import TopDownGrasp
 
 SCALE = 0.8
 """Scale at which the objects have the sizes of appendix A.1."""

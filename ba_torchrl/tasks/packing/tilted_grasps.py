@@ -18,8 +18,8 @@ from ba_torchrl.sim.geometry import (
     quaternion_matrix,
 )
 from ba_torchrl.sim.robots.base import Robot
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.manipulation.hand_clearance import tool_clearances_m
+from ba_torchrl.tasks.manipulation.top_down_grasps import is_reachable
 from ba_torchrl.tasks.packing.base import SUFFICIENT_CLEARANCE_M
 from ba_torchrl.tasks.structures.pieces import CUBOID
 from ba_torchrl.tasks.structures.tilts import resting_frame

@@ -30,9 +30,9 @@ from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, pick_comman
 from ba_torchrl.tasks.structures.assignment import mean_position
 from ba_torchrl.tasks.structures.blueprint import Slot
 from ba_torchrl.tasks.structures.bridges import bridge_yaw_rad
-from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
 from ba_torchrl.tasks.structures.open_loop import StructureTask
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
+from ba_torchrl.tasks.structures.piece_grasps import PickPlaceGrasps
 from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
 from ba_torchrl.tasks.workspace import Spacing, random_points
 

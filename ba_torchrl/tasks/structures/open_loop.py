@@ -14,8 +14,8 @@ from ba_torchrl.sim.bodies import Body, footprint_radius_m
 from ba_torchrl.tasks.base import TASKS, OpenLoopTask
 from ba_torchrl.tasks.structures.base import StructureGoal
 from ba_torchrl.tasks.structures.blueprint import Piece
-from ba_torchrl.tasks.structures.grasps import PickPlaceGrasps
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
+from ba_torchrl.tasks.structures.piece_grasps import PickPlaceGrasps
 from ba_torchrl.tasks.structures.structure import Structure
 from ba_torchrl.tasks.workspace import Spacing
 

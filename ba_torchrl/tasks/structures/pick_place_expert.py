@@ -8,7 +8,6 @@ from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.control.pick_place import PickPlaceLimits
 from ba_torchrl.sim.geometry import Pose, carrying_pose, quaternion_matrix, quaternion_yaw
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.manipulation.pick_place_commands import (
     no_op,
     perturbed_pick,
@@ -16,9 +15,10 @@ from ba_torchrl.tasks.manipulation.pick_place_commands import (
     place_command,
     swaps_fingers,
 )
+from ba_torchrl.tasks.manipulation.top_down_grasps import is_reachable
 from ba_torchrl.tasks.structures.free_space import PlacementArea
-from ba_torchrl.tasks.structures.grasps import SUFFICIENT_CLEARANCE_M, PickPlaceGrasps, Tilted
 from ba_torchrl.tasks.structures.moves import Move
+from ba_torchrl.tasks.structures.piece_grasps import SUFFICIENT_CLEARANCE_M, PickPlaceGrasps, Tilted
 from ba_torchrl.tasks.structures.planner import next_move
 from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
 

@@ -94,10 +94,10 @@ class BenchmarkConfig(StrictModel):
         )
 
 
-Grid = TypeVar("Grid", bound=BenchmarkConfig)
+Benchmark = TypeVar("Benchmark", bound=BenchmarkConfig)
 
 
-def split(values: Mapping[str, Any], model: type[Grid]) -> tuple[Grid, dict[str, Any]]:
+def split(values: Mapping[str, Any], model: type[Benchmark]) -> tuple[Benchmark, dict[str, Any]]:
     """Return the grid that composed settings describe, and the fields that its runs share.
 
     Raises:

@@ -14,7 +14,7 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.clutter import grasp_planner
 from ba_torchrl.tasks.clutter.grasp_planner import CLEARANCE_M, DEEPEST_M, PIXEL_M, GraspPlanner
 from ba_torchrl.tasks.clutter.push_planner import PushPlanner
-from ba_torchrl.tasks.manipulation.grasps import TopDownGrasp
+from ba_torchrl.tasks.manipulation.top_down_grasps import TopDownGrasp
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 WORKSPACE = Workspace((0.3, 0.6), (-0.15, 0.15), (0.01, 0.25))

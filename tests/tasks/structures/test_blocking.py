@@ -9,7 +9,7 @@ from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.sim.shapes import Box, Solid
 from ba_torchrl.sim.world import World
 from ba_torchrl.tasks.manipulation.clearance import path_clearance_m
-from ba_torchrl.tasks.structures.grasps import edge_grasps
+from ba_torchrl.tasks.structures.piece_grasps import edge_grasps
 
 CUBE = Box(size_m=(0.03, 0.03, 0.03))
 AT = (0.45, 0.02, 0.015)

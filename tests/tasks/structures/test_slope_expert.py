@@ -19,8 +19,8 @@ from ba_torchrl.sim.geometry import (
     yaw_quaternion,
 )
 from ba_torchrl.tasks.six_dof import VARIANTS
-from ba_torchrl.tasks.structures.grasps import Tilted
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
+from ba_torchrl.tasks.structures.piece_grasps import Tilted
 from ba_torchrl.tasks.structures.pieces import CUBOID
 from ba_torchrl.tasks.structures.planner import next_move
 from ba_torchrl.tasks.terrain.ramps import EDGE_MARGIN_M, GAP_M

@@ -16,7 +16,7 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.kuka import Kuka
 from ba_torchrl.sim.shapes import Box
 from ba_torchrl.sim.world import World
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
+from ba_torchrl.tasks.manipulation.top_down_grasps import is_reachable
 from ba_torchrl.tasks.structures.pieces import CUBE, CUBOID, ROOF
 from ba_torchrl.tasks.structures.tilts import (
     in_resting_frame,

@@ -24,9 +24,9 @@ from ba_torchrl.sim.geometry import (
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.robots.gripper import Gripper
 from ba_torchrl.tasks.manipulation.clearance import grasp_clearance_m, path_clearance_m
-from ba_torchrl.tasks.manipulation.grasps import is_reachable
 from ba_torchrl.tasks.manipulation.hand_clearance import hand_clearance_m, tool_clearances_m
 from ba_torchrl.tasks.manipulation.pick_place_commands import LEVEL_RAD
+from ba_torchrl.tasks.manipulation.top_down_grasps import is_reachable
 from ba_torchrl.tasks.structures.free_space import extent_along_m
 from ba_torchrl.tasks.structures.moves import DEFICIT_WEIGHT, Grasps
 from ba_torchrl.tasks.structures.structure import Structure
