@@ -28,6 +28,7 @@ from ba_torchrl.envs.rendering import WORKSPACE_VIEW, Direction, RelativePoint, 
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.vision.camera import Camera
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
@@ -169,6 +170,10 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
         """Return the images, [C, H, W] each, by key."""
 
+    @abstractmethod
+    def _cameras(self, scene: Scene) -> dict[str, Camera]:
+        """Return the geometry of the images of `_images`, by key."""
+
     def _is_holding(self, scene: Scene) -> bool:
         """Return whether the gripper holds an object."""
         return scene.robot.held_body() is not None
@@ -241,6 +246,34 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
             at_contact: the call is that of `on_contact`.
         """
         yield self.render(width, height)
+
+    def camera(self, key: str) -> Camera:
+        """Return where the camera of an observed image is, and what its pixels show.
+
+        Args:
+            key: of the image: ``depth``, ``heightmap``, ``rgb``, ``rgb_depth``, ``wrist_rgb`` or
+                ``segmentation``.
+
+        Returns:
+            The geometry of the last observation. Cameras that follow the gripper move.
+
+        Raises:
+            ConfigError: the environment does not observe the image.
+
+        Examples:
+            >>> env = BulletArmEnv("close_loop/block_picking", rgb=True, seed=0)
+            >>> td = env.reset()
+            >>> env.camera("rgb_depth").points(td["rgb_depth"].numpy()).shape
+            (128, 128, 3)
+            >>> env.close()
+        """
+        own = self._cameras(self.scene) if self.config.obs_type == "pixel" else {}
+        others = (extra.cameras(self.scene) for extra in self._observations)
+        cameras = merge_entries([own, *others])
+        if key not in cameras:
+            seen = ", ".join(cameras) or "none; obs_type='pixel' and rgb=True add some"
+            raise ConfigError(f"{self.task_id}: no camera observes {key!r}. Observed: {seen}")
+        return cameras[key]
 
     def get_state(self) -> TensorDict:
         """Return the full state, which ``reset(state, set_state=True)`` restores.

@@ -18,6 +18,7 @@ from ba_torchrl.envs.scene import Scene
 from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.vision.camera import Camera
 from ba_torchrl.sim.vision.camera_views import VIEWS, ViewInput, ViewSetup
 from ba_torchrl.tasks.base import Task
 from ba_torchrl.tasks.workspace import ActionLimits
@@ -104,11 +105,16 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
         scene.controller.grip(command.opening)
 
     def _images(self, scene: Scene) -> dict[str, np.ndarray]:
+        return {keys.DEPTH: self._view.image(self._view_input(scene))}
+
+    def _cameras(self, scene: Scene) -> dict[str, Camera]:
+        return {keys.DEPTH: self._view.camera(self._view_input(scene))}
+
+    def _view_input(self, scene: Scene) -> ViewInput:
         robot = scene.robot
-        seen = ViewInput(
+        return ViewInput(
             self._view_setup, scene.world, scene.camera, robot.tool_pose(), robot.opening()
         )
-        return {keys.DEPTH: self._view.image(seen)}
 
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())

@@ -22,6 +22,7 @@ from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.core.vectors import VectorSpec
 from ba_torchrl.envs.scene import Scene
+from ba_torchrl.sim.vision.camera import Camera, perspective
 from ba_torchrl.sim.vision.camera_views import finger_boxes
 from ba_torchrl.sim.vision.depth import point_cloud
 from ba_torchrl.sim.vision.lens import oblique_lens, side_lenses, wrist_lens
@@ -58,6 +59,10 @@ class Observation(ABC):
 
     def images(self) -> dict[str, ImageSpec]:
         """Return the declarations of its images, by key."""
+        return {}
+
+    def cameras(self, scene: Scene) -> dict[str, Camera]:
+        """Return the geometry of its images in the present scene, by key."""
         return {}
 
     def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
@@ -162,6 +167,14 @@ class RgbDepth(Observation):
             keys.RGB_DEPTH: ImageSpec(1, size, far, near, frame="camera"),
         }
 
+    def cameras(self, scene: Scene) -> dict[str, Camera]:
+        """Return the geometry of the camera opposite the robot."""
+        lens, pixels = oblique_lens(self.workspace.center), self.config.camera_pixels
+        return {
+            keys.RGB: perspective(lens, pixels, RGBD_RANGE_M, "color"),
+            keys.RGB_DEPTH: perspective(lens, pixels, RGBD_RANGE_M),
+        }
+
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the image and its depth, from the camera opposite the robot."""
         lens = oblique_lens(self.workspace.center)
@@ -260,6 +273,13 @@ class WristRgb(Observation):
         spec = ImageSpec(3, size, 255, storage="exact", frame="camera", dtype=torch.uint8)
         return {keys.WRIST_RGB: spec}
 
+    def cameras(self, scene: Scene) -> dict[str, Camera]:
+        """Return the geometry of the camera on the gripper."""
+        lens = wrist_lens(scene.robot.tool_frame())
+        return {
+            keys.WRIST_RGB: perspective(lens, self.config.camera_pixels, WRIST_RANGE_M, "color")
+        }
+
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the image."""
         lens = wrist_lens(scene.robot.tool_frame())
@@ -276,6 +296,12 @@ class Segmentation(Observation):
         size, last = self.config.camera_pixels, len(segmentation_names(scene)) - 1
         spec = Bounded(0, last, (1, size, size), device="cpu", dtype=torch.int32)
         return {keys.SEGMENTATION: spec}
+
+    def cameras(self, scene: Scene) -> dict[str, Camera]:
+        """Return the geometry of the camera opposite the robot."""
+        lens = oblique_lens(self.workspace.center)
+        camera = perspective(lens, self.config.camera_pixels, RGBD_RANGE_M, "color")
+        return {keys.SEGMENTATION: camera}
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
         """Return the indices of the bodies in `segmentation_names`."""

@@ -25,6 +25,7 @@ from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
 from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits
 from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
+from ba_torchrl.sim.vision.camera import Camera, orthographic
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView
 from ba_torchrl.sim.world import Physics, World
 from ba_torchrl.tasks.base import Task
@@ -152,6 +153,12 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
         empty = np.zeros((self._in_hand_kind.channels, size, size))
         heights = np.clip(self._heightmap(scene), 0.0, self.workspace.z[1])
         return {keys.HEIGHTMAP: heights[None], keys.IN_HAND: self._memory.get("in_hand", empty)}
+
+    def _cameras(self, scene: Scene) -> dict[str, Camera]:
+        space = self.workspace
+        center, range_m = (*space.center, space.z[1]), (0.0, space.z[1])
+        size = self.config.obs_size
+        return {keys.HEIGHTMAP: orthographic(center, space.width, size, range_m, "height")}
 
     def _is_holding(self, scene: Scene) -> bool:
         return scene.controller.held is not None

@@ -28,9 +28,11 @@ from typing import ClassVar
 
 import numpy as np
 
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.sim.geometry import Pose, YawPose, yaw_quaternion
 from ba_torchrl.sim.shapes import Box
+from ba_torchrl.sim.vision.camera import Camera, orthographic, perspective
 from ba_torchrl.sim.vision.depth import (
     HeightCamera,
     PosedShape,
@@ -158,6 +160,10 @@ class View(ABC):
     def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [C, H, W] float64."""
 
+    def camera(self, scene: ViewInput) -> Camera:
+        """Return the geometry of the last channel of the image."""
+        raise ConfigError(f"{type(self).__name__} does not say where its camera is")
+
 
 VIEWS: Registry[View] = Registry("view type", "ba_torchrl.sim", View)
 
@@ -202,6 +208,21 @@ class TopDown(View):
         heights = scene.camera.heightmap(center, setup.width_m, setup.pixels, turn)
         camera_z = z + setup.camera_height_m if self.follows_z else setup.fixed_camera_z_m
         return self.to_values(scene, heights, center, turn, camera_z)
+
+    def camera(self, scene: ViewInput) -> Camera:
+        """Return the geometry; depths below the tool are those of a camera at its height."""
+        setup, ((x, y, z), yaw) = scene.setup, scene.tool
+        return orthographic(
+            (
+                *((x, y) if self.follows_xy else setup.center_m),
+                z + setup.camera_height_m if self.follows_z else z,
+            ),
+            setup.width_m,
+            setup.pixels,
+            self.range_m(setup),
+            "height" if self.shows_height else "depth",
+            yaw if self.follows_yaw else 0.0,
+        )
 
     def to_values(
         self,
@@ -271,6 +292,10 @@ class PointSplat(View):
         heights = splat_heightmap(points, (x, y), setup.width_m, setup.pixels)
         return self._top_down.to_values(scene, heights, (x, y), 0.0, ceiling)
 
+    def camera(self, scene: ViewInput) -> Camera:
+        """Return the geometry."""
+        return self._top_down.camera(scene)
+
     @property
     def _top_down(self) -> TopDown:
         return TopDown(
@@ -294,8 +319,8 @@ class PerspectiveTopDown(View):
 
     def image(self, scene: ViewInput) -> np.ndarray:
         """Return the image, [1, H, W]."""
-        setup, ((x, y, z), yaw) = scene.setup, scene.tool
-        lens = Lens((x, y, z + setup.camera_height_m), (x, y, z), self.fov_rad)
+        setup, (_, yaw) = scene.setup, scene.tool
+        lens = self._lens(scene)
         depth = depth_image([scene.camera.mesh], lens, setup.pixels)
         values = np.clip(depth, *self.range_m(setup))
         scale = lens.focal_px(setup.pixels) / setup.camera_height_m
@@ -308,6 +333,15 @@ class PerspectiveTopDown(View):
             0.0,
         )
         return values[None]
+
+    def camera(self, scene: ViewInput) -> Camera:
+        """Return the geometry."""
+        setup = scene.setup
+        return perspective(self._lens(scene), setup.pixels, self.range_m(setup))
+
+    def _lens(self, scene: ViewInput) -> Lens:
+        (x, y, z), _ = scene.tool
+        return Lens((x, y, z + scene.setup.camera_height_m), (x, y, z), self.fov_rad)
 
 
 @dataclass(frozen=True)
@@ -339,6 +373,12 @@ class Oblique(View):
             values = lens.heights_m(values)
         return np.clip(values, *self.range_m(setup))[None]
 
+    def camera(self, scene: ViewInput) -> Camera:
+        """Return the geometry."""
+        setup, values = scene.setup, "height" if self.shows_height else "depth"
+        lens = oblique_lens(setup.center_m)
+        return perspective(lens, setup.pixels, self.range_m(setup), values)
+
 
 @dataclass(frozen=True)
 class ObliqueRgbd(View):
@@ -357,6 +397,11 @@ class ObliqueRgbd(View):
         rgb, depth = render_rgbd(scene.world, oblique_lens(setup.center_m), setup.pixels)
         depth = np.clip(depth, *self.range_m(setup))
         return np.concatenate([np.moveaxis(rgb / 255.0, -1, 0), depth[None]])
+
+    def camera(self, scene: ViewInput) -> Camera:
+        """Return the geometry."""
+        setup = scene.setup
+        return perspective(oblique_lens(setup.center_m), setup.pixels, self.range_m(setup))
 
 
 def _register(name: str, kind: type[View], **options: bool) -> None:
