@@ -1,4 +1,5 @@
-"""Print what is large: files, classes far below a base, and what one reads for six subjects.
+"""Print what is large: files, classes far below a base, what one reads for six subjects; and the
+private names of other libraries that are used.
 
 python -m docs.layout
 
@@ -16,6 +17,7 @@ import tokenize
 from pathlib import Path
 from typing import NamedTuple
 
+from docs.private_names import OTHERS, REASONS
 from docs.sources import PACKAGE, ROOT, Definition, definitions, file_of, sources
 
 MOST_LINES, MOST_LEVELS = 400, 2
@@ -118,6 +120,10 @@ def main() -> None:
         for name in definitions(module):
             if levels(Definition(module, name)) > MOST_LEVELS:
                 print(f"  {module}.{name}: {levels(Definition(module, name))}")
+    for owner, reasons in (("torch and TorchRL", REASONS), ("other libraries", OTHERS)):
+        print(f"private names of {owner}: {len(reasons)}")
+        for name, reason in reasons.items():
+            print(f"  {name}: {reason}")
     print("files to read")
     for subject in SUBJECTS:
         modules = to_read(subject)

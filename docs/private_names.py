@@ -18,8 +18,37 @@ from functools import cache
 
 from docs.sources import PACKAGE, imports, sources
 
-REASONS: dict[str, str] = {}
-"""By name: an attribute follows its class, a module its package."""
+REASONS = {
+    "LossModule._make_vmap": "the loss computes all critics by one function, made once",
+    "IQLLoss._vmap_qvalue_networkN0": "that function, which targets call with other networks",
+    "LossModule._reduce_loss": "how TorchRL's losses apply masks and importance weights",
+    "Module._apply": "torch moves and converts parameters by it, and shared ones stay shared",
+    "MultiCollector._queue_len": "a batch is discarded if the only place of the queue is taken",
+    "PrioritizedSampler._init": "makes NumPy's trees where the native ones do not load",
+    "PrioritizedSampler._min_tree": "TorchRL's methods use the trees by this name",
+    "PrioritizedSampler._sum_tree": "TorchRL's methods use the trees by this name",
+    "RoundRobinWriter._cursor": "the next place, which skips demonstrations",
+    "Sampler._rng": "where a buffer puts its generator",
+    "SharedMemWeightSyncScheme._ack_queues": "what `_wait_for_ack` waits for",
+    "TargetNetUpdater._sources": "what an updater copies; buffers are added",
+    "TargetNetUpdater._targets": "where to; buffers are added",
+    "WeightSyncScheme._wait_for_ack": "TorchRL waits forever for a worker that has ended",
+    "torch._C._are_functorch_transforms_active": "NumPy cannot compute inside `torch.func`",
+    "torch._C._functorch.is_functorch_wrapped_tensor": "such a tensor cannot be kept",
+    "torch._C._len_torch_dispatch_stack": "modes such as FlopCounterMode see one thread only",
+    "torch.autograd.forward_ad._current_level": "NumPy has no forward-mode derivatives",
+    "torch.utils._python_dispatch._disable_current_modes": "constants are real tensors in exports",
+}
+"""Of names of torch and TorchRL. An attribute follows its class, a module its package."""
+
+OTHERS = {
+    "_cached_instances": "escnn keeps layers that were made before its signs were fixed",
+    "_chunk_key": "zarr 2 has no other way from a chunk's index to its file",
+    "_clebsh_gordan_tensor": "escnn's signs differ between machines",
+    "_download": "LeRobot would load from the Hub what a folder lacks",
+    "_pull_from_repo": "LeRobot would load from the Hub what a folder lacks",
+}
+"""Of names of other libraries."""
 
 HOOKS = {
     "EnvBase._supports_set_state",

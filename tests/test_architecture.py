@@ -3,7 +3,7 @@
 import re
 from pathlib import Path
 
-from docs import architecture, results
+from docs import architecture, private_names, results
 
 ROOT = Path(__file__).parents[1]
 PAGE = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
@@ -16,6 +16,10 @@ def test_the_picture_is_drawn_from_the_imports():
 def test_the_page_of_results_has_the_present_results():
     page = results.PAGE.read_text(encoding="utf-8")
     assert results.page_with_results(page) == page, "run `python -m docs.results`"
+
+
+def test_every_private_name_of_another_library_has_its_reason():
+    assert private_names.found() == {*private_names.REASONS, *private_names.OTHERS}
 
 
 def test_every_folder_has_a_line():

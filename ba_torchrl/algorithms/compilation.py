@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from collections.abc import Callable
 
 import torch
@@ -24,23 +25,14 @@ def check_compiler(device: torch.device) -> None:
         language, package = "C", "gcc"
         is_found = bool(os.environ.get("CC") or shutil.which("gcc") or shutil.which("clang"))
     else:
-        language, package, is_found = "C++", "g++", _has_cpp_compiler()
+        language, package = "C++", "g++"
+        found = os.environ.get("CXX") or ("clang++" if sys.platform == "darwin" else "g++")
+        is_found = shutil.which(found) is not None
     if not is_found:
         raise ConfigError(
             f"compile_mode: this needs a {language} compiler (Debian: apt install {package}); "
             "install one, or leave compile_mode out"
         )
-
-
-def _has_cpp_compiler() -> bool:
-    # a slow import, needed by compiled runs only
-    from torch._inductor.cpp_builder import get_cpp_compiler
-
-    try:
-        get_cpp_compiler()
-    except RuntimeError:
-        return False
-    return True
 
 
 class CompiledLoss:

@@ -416,15 +416,6 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
             reward = self._dense_reward(before, reward)
         return self._tensordict(self._observation, reward=reward, **self._ends)
 
-    def _step_proc_data(self, next_tensordict_out: TensorDictBase) -> TensorDictBase:
-        """Return the entries of `_step` as they are: none is missing, and shapes are the specs'.
-
-        TorchRL walks through the specs after every step to complete them.
-        """
-        if self.run_type_checks:
-            return super()._step_proc_data(next_tensordict_out)
-        return next_tensordict_out
-
     # ----------------------------------------------------------------------------------------
 
     def _make_specs(self) -> None:

@@ -213,11 +213,9 @@ def test_what_cannot_be_compiled_is_refused(tmp_path, name, mode, message):
         make_experiment(tmp_path, "cnn", {"name": name}, compile_mode=mode)
 
 
-def test_a_missing_compiler_is_found_before_the_run(tmp_path):
-    with (
-        torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",)}),
-        pytest.raises(ConfigError, match=r"compile_mode: .*C\+\+ compiler"),
-    ):
+def test_a_missing_compiler_is_found_before_the_run(tmp_path, monkeypatch):
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    with pytest.raises(ConfigError, match=r"compile_mode: .*C\+\+ compiler"):
         make_experiment(tmp_path / "run", "cnn", {"name": "sac"}, compile_mode="default")
     assert not (tmp_path / "run").exists()
 
@@ -231,10 +229,10 @@ def test_a_gpu_needs_a_c_compiler(monkeypatch):
     check_compiler(torch.device("cuda"))
 
 
-def test_a_compiled_run_is_read_without_a_compiler(tmp_path):
+def test_a_compiled_run_is_read_without_a_compiler(tmp_path, monkeypatch):
     made = make_experiment(tmp_path, "cnn", {"name": "sac"}, compile_mode="default")
-    with torch._inductor.config.patch({"cpp.cxx": ("no-such-compiler",)}):
-        assert read_config(tmp_path / "run").compile_mode == made.config.compile_mode
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    assert read_config(tmp_path / "run").compile_mode == made.config.compile_mode
 
 
 @pytest.mark.slow

@@ -126,7 +126,7 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
             return None
         schema = {
             key: (value.dtype, value.shape[1:])
-            for key, value in storage._storage.items(True, True)
+            for key, value in storage.columns.items(True, True)
             if key != _INDEX
         }
         for key, image_type in storage.image_types.items():

@@ -276,7 +276,12 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
         """
         if not self.initialized:
             raise KeyError(f"{key!r}: the replay is empty")
-        return self._storage[key][: len(self)]
+        return self.columns[key]
+
+    @property
+    def columns(self) -> TensorDictBase:
+        """Views of all entries but the images, of all stored transitions; needs a first one."""
+        return super().get(slice(None))
 
     @property
     def image_types(self) -> dict[str, tuple[torch.dtype, torch.Size]]:
@@ -297,11 +302,9 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
         """Bytes of memory in use, without reserved pages that were never written."""
         if not self._frames:
             return 0
-        row = sum(
-            value[0].numel() * value.element_size() for value in self._storage.values(True, True)
-        )
-        row += self._slots.element_size() * 2 * len(self.codecs)
-        return len(self) * row + sum(frames.nbytes for frames in self._frames.values())
+        columns = sum(value.nbytes for value in self.columns.values(True, True))
+        slots = len(self) * self._slots.element_size() * 2 * len(self.codecs)
+        return columns + slots + sum(frames.nbytes for frames in self._frames.values())
 
     def _empty(self) -> None:
         super()._empty()
@@ -314,7 +317,6 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
         if not self.initialized:
             return {"size": 0}
         size = len(self)
-        columns = self._storage[:size]
         frames = {}
         for number, (key, table) in enumerate(self._frames.items()):
             packed, sizes = table.dump()
@@ -328,7 +330,7 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
             "size": size,
             "columns": {
                 "/".join(key) if isinstance(key, tuple) else key: value
-                for key, value in columns.items(True, True)
+                for key, value in self.columns.items(True, True)
             },
             "frames": frames,
         }
