@@ -23,8 +23,10 @@ from ba_torchrl.algorithms.base import ALGORITHMS
 from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.envs.description import describe, expert_scores, summary, tasks_by_heading
 from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.record.results import read_result, shipped_file
+from ba_torchrl.record.statistics import wilson
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.policy import read_card, shipped_file, shipped_policies
+from ba_torchrl.training.policy import evaluate_command, shipped_policies
 from docs.notebook import markdown, notebook
 
 project, author, release = "BA-TorchRL", "The BA-TorchRL authors", __version__
@@ -195,12 +197,12 @@ def task_page(task: str) -> str:
     for name, value in found.rows().items():
         lines.append(f"| {f'`{name}`' if name in keywords else name} | {_cell(value)} |")
     if task in shipped_policies():
-        card = read_card(shipped_file(task))
-        low, high = card.interval
+        result = read_result(shipped_file(task))
+        rate, low, high = wilson(result.last.success_rate, result.last.episodes)
         lines += [
-            f"| trained policy | {card.success_rate:.2f} ({low:.2f} to {high:.2f}) over "
-            f"{card.episodes} episodes, {card.label} |",
-            f"| check it | `{card.evaluate}` |",
+            f"| trained policy | {rate:.2f} ({low:.2f} to {high:.2f}) over "
+            f"{result.last.episodes} episodes, {result.label} |",
+            f"| check it | `{evaluate_command(task, result)}` |",
             f"| watch it | `ba-torchrl play {task} policy=trained video=film.gif` |",
         ]
     lines += [f"| watch the expert | `ba-torchrl play {task} video=film.gif` |"]

@@ -1,10 +1,10 @@
-"""Write results.md and its figures from the records.
+"""Write results.md and its figures from results.
 
 python -m docs.results                        # the page
-python -m docs.results runs/equivariance      # add the records of these runs first
+python -m docs.results runs/equivariance      # add the results of these runs first
 
-A record is the `result.json` of a finished run, or the test of a policy (`docs.shipped`). Those of
-a benchmark that answers a question are in docs/results/BENCHMARK, all others in the package.
+Those of a benchmark that answers a question are in docs/results/BENCHMARK, those of the shipped
+policies in their files (`docs.shipped`).
 """
 
 from __future__ import annotations
@@ -23,10 +23,9 @@ from ba_torchrl.core.files import write_text
 from ba_torchrl.envs.description import describe, tasks_by_heading
 from ba_torchrl.record.leaderboard import (
     LEGEND,
-    RECORDS,
     Leaderboard,
     leaderboard,
-    read_records,
+    read_results,
     success_text,
 )
 from ba_torchrl.record.plots import own_style, save
@@ -42,7 +41,6 @@ from ba_torchrl.record.summary import (
     pipes,
 )
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training.policy import read_card, shipped_file
 from ba_torchrl.training.protocol import PROTOCOL
 from docs.sources import ROOT
 
@@ -71,21 +69,23 @@ DIFFERENCES = ("task", "first", "second", "seeds", "area", "late success", "last
 
 
 def add(roots: Sequence[str]) -> int:
-    """Write the records of the finished runs below some folders to their places.
+    """Write the results of the finished runs below some folders to their places.
 
     Returns:
         Their number.
 
     Raises:
-        ValueError: runs have the same benchmark, task, label and seed, and with them the same file.
+        ValueError: runs have the same benchmark, task, label and seed, and with them the same file,
+            or a benchmark that answers no question.
     """
     named: dict[Path, Run] = {}
     for run in load_runs(roots)[0]:
         result = run.result
         name = f"{result.task} {result.label} seed{result.seed}"
         name = "".join(c if c.isalnum() or c in "-." else "_" for c in name) + ".json"
-        answers = result.benchmark is not None and (FOLDER / result.benchmark).is_dir()
-        path = (FOLDER / result.benchmark if answers else RECORDS) / name
+        path = FOLDER / str(result.benchmark) / name
+        if not path.parent.is_dir():
+            raise ValueError(f"{run.folder} is no run of a question: there is no {path.parent}")
         if path in named:
             raise ValueError(f"{named[path].folder} and {run.folder} are both {name}")
         named[path] = run
@@ -95,25 +95,25 @@ def add(roots: Sequence[str]) -> int:
 
 
 def present() -> Leaderboard:
-    """Return the package's records by task and method, tasks of plugins left out."""
+    """Return the shipped policies' results by task and method, tasks of plugins left out."""
     tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
-    return leaderboard(completed(read_records()), [], tasks, PROTOCOL)
+    return leaderboard(completed(read_results()), [], tasks, PROTOCOL)
 
 
 def questions() -> dict[str, Section]:
-    """Return the records of each benchmark that answers a question, by its name."""
+    """Return the results of each benchmark that answers a question, by its name."""
     return {
-        folder.name: Section(folder.name, grouped(completed(read_records(folder))))
+        folder.name: Section(folder.name, grouped(completed(read_results(folder))))
         for folder in sorted(FOLDER.iterdir())
         if folder.is_dir()
     }
 
 
 def page_with_results(text: str) -> str:
-    """Return the page with tables of the present records between its markers.
+    """Return the page with tables of the present results between its markers.
 
     Raises:
-        KeyError: there are no records of a marker's name.
+        KeyError: there are no results of a marker's name.
     """
     texts = {name: "\n".join(_question(section)) for name, section in questions().items()}
     texts[ALL_TASKS] = "\n".join(_all_tasks(present()))
@@ -192,14 +192,13 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
 
 
 def _trained(runs: Sequence[Run]) -> Iterator[str]:
-    """Yield where the policies of records were trained, and what their cards do not know."""
-    files = {shipped_file(run.result.task): run for run in runs if run.result.policy_file}
-    cards = [read_card(file) for file in files]
-    for cpu in sorted({card.hardware["cpu"] for card in cards}):
-        of_cpu = [card for card in cards if card.hardware["cpu"] == cpu]
-        commits = sorted({card.versions["commit"] for card in of_cpu})
+    """Yield where policies in files were trained, and what is not known of their training."""
+    results = [run.result for run in runs if run.result.trained_on]
+    for cpu in sorted({result.trained_on.hardware["cpu"] for result in results}):
+        of_cpu = [r.trained_on for r in results if r.trained_on.hardware["cpu"] == cpu]
+        commits = sorted({trained_on.versions["commit"] for trained_on in of_cpu})
         yield f"Trained on {cpu}: {len(of_cpu)} policies; commits: {', '.join(commits)}.\n"
-    if unknown := [f"`{card.task}`" for card in cards if card.demonstrations is None]:
+    if unknown := [f"`{result.task}`" for result in results if result.demonstrations is None]:
         yield f"Demonstrations and expert labels were not recorded for {', '.join(unknown)}.\n"
 
 
@@ -274,9 +273,9 @@ def _mean(values: Sequence[float | None], form: str = ".0f") -> str:
 
 
 def main() -> None:
-    """Add records, and write the page and its figures."""
+    """Add results, and write the page and its figures."""
     if sys.argv[1:]:
-        print(f"{add(sys.argv[1:])} records added")
+        print(f"{add(sys.argv[1:])} results added")
     for name, section in questions().items():
         plot_groups(section.groups, [FOLDER / f"{name}.svg"], columns=1)
     plot_tasks(present(), FOLDER / "tasks.svg")

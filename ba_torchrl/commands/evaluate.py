@@ -13,7 +13,7 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, PluginSettings, Seed, Text, VectorSettings, VideoFile
 from ba_torchrl.core.config import FIRST_TEST_SEED, LocalPath, Which
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.record.results import CITABLE_EPISODES, TestedPolicy
+from ba_torchrl.record.results import CITABLE_EPISODES, PolicyTest
 from ba_torchrl.record.statistics import wilson
 from ba_torchrl.record.video import write_video
 
@@ -58,17 +58,16 @@ def main(settings: Settings) -> None:
     from ba_torchrl.training.protocol import PROTOCOL
 
     policy = load_policy(settings.policy, settings.which, settings.device)
-    card, resolved = policy.card, policy.config.resolved_env
+    resolved = policy.config.resolved_env
     seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
     found = play(policy, settings, seed)
     text = success_text(found.success_rate, found.episodes, policy.task)
     print(f"{text}, {found.mean_length:.1f} steps each")
-    if card is not None:
-        low, high = card.interval
-        print(
-            f"  card      {card.success_rate:.2f} ({low:.2f} to {high:.2f}) over {card.episodes} "
-            f"episodes{'' if card.protocol else ', before protocol 1'}"
-        )
+    if (known := policy.result) is not None:
+        rate, low, high = wilson(known.last.success_rate, known.last.episodes)
+        other = "" if known.protocol == PROTOCOL else f", protocol {known.protocol}"
+        episodes = f"{known.last.episodes} episodes{other}"
+        print(f"  in file   {rate:.2f} ({low:.2f} to {high:.2f}) over {episodes}")
     print(f"  policy    update {policy.updates}, {policy.source}")
     episodes = f"protocol {PROTOCOL}"
     if settings.seed is not None:
@@ -83,7 +82,7 @@ def main(settings: Settings) -> None:
 
 def play(
     policy: TrainedPolicy, settings: EpisodeSettings, seed: int = FIRST_TEST_SEED
-) -> TestedPolicy:
+) -> PolicyTest:
     """Play greedy episodes in new environments, by default those of the protocol."""
     from ba_torchrl.training.protocol import run_test
 

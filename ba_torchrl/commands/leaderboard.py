@@ -1,4 +1,4 @@
-"""Print success by task and method: the package's records and finished runs beside them.
+"""Print success by task and method: the shipped policies, and finished runs beside them.
 
 ba-torchrl leaderboard
 ba-torchrl leaderboard runs
@@ -13,7 +13,7 @@ from ba_torchrl.cli.types import Folders, PluginSettings
 from ba_torchrl.commands.report import completed
 from ba_torchrl.core.config import PROTOCOL
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.record.leaderboard import LEGEND, leaderboard, read_records
+from ba_torchrl.record.leaderboard import LEGEND, leaderboard, read_results
 from ba_torchrl.record.results import why_unfinished
 from ba_torchrl.record.summary import load_runs, markdown, pipes
 
@@ -22,16 +22,16 @@ class Settings(PluginSettings):
     """Settings of this command."""
 
     runs: Folders | None = None
-    """A folder or a list of folders with finished runs; null for the package's records alone."""
+    """A folder or a list of folders with finished runs; null for the shipped policies alone."""
 
 
 def main(settings: Settings) -> None:
     """Print the table."""
-    records, roots = read_records(), settings.runs or ()
+    shipped, roots = read_results(), settings.runs or ()
     own, unfinished = load_runs(roots)
     if roots and not own and not unfinished:
         raise ConfigError(f"no run below {', '.join(roots)}")
-    board = leaderboard(completed(records), completed(own), list_tasks(), PROTOCOL)
+    board = leaderboard(completed(shipped), completed(own), list_tasks(), PROTOCOL)
     rows = list(board.rows())
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     padded = ([c.ljust(width) for c, width in zip(row, widths, strict=True)] for row in rows)

@@ -18,7 +18,12 @@ from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import check_writable_folder
 from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.record.results import CITABLE_EPISODES, CONFIG_FILE, NON_LEARNING_FIELDS
+from ba_torchrl.record.results import (
+    CITABLE_EPISODES,
+    CONFIG_FILE,
+    NON_LEARNING_FIELDS,
+    RESULT_FILE,
+)
 from ba_torchrl.training.config import ExperimentConfig
 
 logger = logging.getLogger(__name__)
@@ -59,12 +64,10 @@ def main(config: ExperimentConfig) -> None:
         f"{result.seconds / 60:.1f} minutes"
     )
     print(f"  best        {best.success_rate:.2f}, the checkpoint of update {best.updates}")
-    if result.curve is not None:
-        print(f"  curve       {result.curve}")
-    if result.video is not None:
-        print(f"  video       {result.video}")
-    print(f"  checkpoint  {result.checkpoint}")
-    print(f"  result      {result.record}")
+    for name in ("curve", "video", "checkpoint"):
+        if name in result.files:
+            print(f"  {name:<10}  {config.folder / result.files[name]}")
+    print(f"  result      {config.folder / RESULT_FILE}")
     print("  to use it in Python:")
     print(f'    policy = ba_torchrl.load_policy({config.run_dir!r}, which="latest")  # or "best"')
     print("    env = policy.make_env()")

@@ -297,6 +297,20 @@ def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
         raise OSError(code, os.strerror(code), str(path)) from error
 
 
+def header_texts(path: Path) -> dict[str, str]:
+    """Return the texts in the header of a safetensors file, by name; no tensor is read.
+
+    Raises:
+        DamagedFilesError: it is not such a file, its header is longer than 100 MB, or the file has
+            another length than the header says.
+    """
+    try:
+        with safe_open(path, framework="np") as file:
+            return file.metadata() or {}
+    except SafetensorError as error:
+        raise DamagedFilesError(f"{path} is not a whole safetensors file: {error}") from None
+
+
 def json_bytes(path: str | Path) -> bytes:
     """Return the text of a JSON file, without the byte-order mark that editors may add."""
     return Path(path).read_bytes().removeprefix(BOM_UTF8)

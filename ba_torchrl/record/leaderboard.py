@@ -1,18 +1,22 @@
-"""Success by task and method, from the package's own records and from runs beside them."""
+"""Success by task and method, from the shipped policies' results and from runs beside them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from importlib.resources import files
 from pathlib import Path
 
-from ba_torchrl.record.results import CITABLE_EPISODES, RunResult, read_result
+from ba_torchrl.record.results import (
+    CITABLE_EPISODES,
+    POLICIES,
+    POLICY_SUFFIX,
+    RunResult,
+    read_result,
+)
 from ba_torchrl.record.summary import DIRECTION, ENOUGH_SEEDS, Group, Run, grouped
 from ba_torchrl.tasks.base import TASKS
 
-RECORDS = Path(str(files("ba_torchrl"))) / "results"
-"""Folder of the package's records, a JSON file each."""
+_SUFFIXES = (POLICY_SUFFIX, ".json")
 EMPTY = "–"
 LEGEND = (
     "Success of the greedy last policy, or of that of a file, with its 95 % interval; seeds × test "
@@ -52,10 +56,10 @@ def success_text(group: Group) -> str:
     return f"{value:.2f} ({low:.2f} to {high:.2f}) {len(group.runs)}×{episodes}{mark}"
 
 
-def read_records(folder: Path | None = None) -> list[Run]:
-    """Read the records in a folder, a JSON file each; by default those of the package."""
-    files = sorted((folder or RECORDS).glob("*.json"))
-    return [Run(path, read_result(path)) for path in files]
+def read_results(folder: Path | None = None) -> list[Run]:
+    """Read the results in the files below a folder, by default those of the shipped policies."""
+    files = sorted((folder or POLICIES).rglob("*.*"))
+    return [Run(file, read_result(file)) for file in files if file.suffix in _SUFFIXES]
 
 
 def leaderboard(

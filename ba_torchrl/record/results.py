@@ -1,7 +1,7 @@
-"""Results of finished runs, one ``result.json`` per run folder.
+"""Results of finished runs, ``result.json`` in a run folder, and of policies, in their files.
 
-`RunResult` is the schema. Reports are made from these files only, which somebody else may have
-written: `read_result` reads them all, imports nothing, and refuses what no run can have.
+`RunResult` is the schema of both. Reports are made from these files only, which somebody else may
+have written: `read_result` reads them all, imports nothing, and refuses what no run can have.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from collections.abc import Collection, Iterable, Mapping
 from datetime import datetime, timezone
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path, PurePosixPath
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 from typing_extensions import Self
@@ -22,9 +22,14 @@ from typing_extensions import Self
 from ba_torchrl import __version__
 from ba_torchrl.core.config import FIRST_TEST_SEED, MAX_SEED, PROTOCOL, StrictModel, explain
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.files import json_bytes, read_json, write_text
+from ba_torchrl.core.files import header_texts, json_bytes, read_json, write_text
 
 RESULT_FILE = "result.json"
+POLICY_SUFFIX = ".safetensors"
+POLICY_RESULT = "result"
+"""Name of the result in the header of a policy's file."""
+POLICIES = Path(__file__).parents[1] / "policies"
+"""Folder of the policies that the package ships; that of a task is ``TASK.safetensors``."""
 CONFIG_FILE = "config.json"
 FAILURE_FILE = "failure.json"
 """Written by a benchmark into the folder of a run that failed: ``reason``, ``when``, ``log``."""
@@ -79,10 +84,8 @@ class CurvePoint(StrictModel):
     """Mean steps per episode, failed episodes included."""
 
 
-class TestedPolicy(StrictModel):
-    """A greedy policy in the episodes of a test, which neither trained nor selected it."""
-
-    __test__: ClassVar[bool] = False  # no test of pytest
+class PolicyTest(StrictModel):
+    """Outcomes of a greedy policy in episodes that neither trained nor selected it."""
 
     updates: Count
     """Gradient updates of the policy."""
@@ -120,11 +123,20 @@ class TestedPolicy(StrictModel):
         return self.episodes >= CITABLE_EPISODES
 
 
-class RunResult(StrictModel):
-    """Results and settings of a run, or the test of a policy from a file (``policy_file``).
+class Machine(StrictModel):
+    """What something was computed on."""
 
-    Of a policy from a file, `last` and `best` are both that policy, there is no curve, precision
-    and hardware are those of the test, and what its card does not know of its training is None.
+    hardware: dict[str, Any]
+    """As in `RunResult`."""
+    versions: dict[str, str]
+    """As in `RunResult`."""
+
+
+class RunResult(StrictModel):
+    """Results and settings of a run, or of a policy in a file (``policy_file``).
+
+    Of a policy in a file, `last` and `best` are the same test, there is no curve, versions,
+    precision and hardware are those of the test, and what is not known of its training is None.
     """
 
     format: Literal[3] = 3
@@ -142,12 +154,14 @@ class RunResult(StrictModel):
     seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
     curve: list[CurvePoint]
     """Evaluations in the order of updates, the first of the untrained policy."""
-    last: TestedPolicy
+    last: PolicyTest
     """The policy that training ends with: the main number."""
-    best: TestedPolicy
+    best: PolicyTest
     """The checkpoint with the best evaluation in `curve`, the newest of equal ones."""
     policy_file: str | None = None
-    """SHA-256 of the file of the tested policy; None for a run."""
+    """SHA-256 of the weights in the policy's file; None for a run."""
+    trained_on: Machine | None = None
+    """Where the policy in a file was trained, if it is known; None for a run."""
     demonstrations: Count | None
     """Episodes of demonstrations."""
     demonstration_steps: Count | None
@@ -204,13 +218,18 @@ class RunResult(StrictModel):
 
     @field_validator("last", "best")
     @classmethod
-    def _check_seeds(cls, test: TestedPolicy, info: ValidationInfo) -> TestedPolicy:
+    def _check_seeds(cls, test: PolicyTest, info: ValidationInfo) -> PolicyTest:
         of_protocol = [*range(FIRST_TEST_SEED, FIRST_TEST_SEED + test.episodes)]
         if info.data.get("protocol") == PROTOCOL and test.seeds != of_protocol:
             raise ValueError(
                 f"the seeds are not those of protocol {PROTOCOL}, {FIRST_TEST_SEED} and following"
             )
         return test
+
+    @property
+    def updates(self) -> int:
+        """Gradient updates of the last policy."""
+        return self.last.updates
 
 
 def write_result(folder: str | Path, result: RunResult) -> Path:
@@ -219,22 +238,41 @@ def write_result(folder: str | Path, result: RunResult) -> Path:
 
 
 def read_result(path: str | Path) -> RunResult:
-    """Read the result of a run, which somebody else may have written, from its folder or file.
+    """Read a result, which somebody else may have written, without the weights of a policy.
+
+    Args:
+        path: a run folder, its ``result.json``, or the ``.safetensors`` file of a policy.
 
     Raises:
-        ConfigError: the file cannot be read, or is not the result of a run.
+        ConfigError: the file cannot be read, or holds no result.
     """
     path = Path(path)
     file = path / RESULT_FILE if path.is_dir() else path
     try:
-        return RunResult.model_validate_json(json_bytes(file))
+        text: str | bytes = json_bytes(file) if file.suffix != POLICY_SUFFIX else _in_header(file)
+        return RunResult.model_validate_json(text)
     except OSError as error:
-        raise ConfigError(f"cannot read {file}: {error.strerror}") from None
+        raise ConfigError(f"cannot read {file}: {error.strerror or error}") from None
     except ValidationError as error:
         problems = explain(error, RunResult, "result").problems
         more = f" (and {len(problems) - 1} more)" if problems[1:] else ""
         reason = " ".join(f"{problems[0][1]}{more}".split())
-        raise ConfigError(f"{file} is not the result of a run: {reason}") from None
+        raise ConfigError(f"{file} has no valid result: {reason}") from None
+
+
+def _in_header(file: Path) -> str:
+    """Return the text of the result in a policy's file."""
+    texts = header_texts(file)
+    if POLICY_RESULT not in texts:
+        raise ConfigError(
+            f"{file} holds no result; `ba-torchrl export` writes a policy with that of its test"
+        )
+    return texts[POLICY_RESULT]
+
+
+def shipped_file(task: str) -> Path:
+    """Return the file in which the package ships the policy of a task."""
+    return POLICIES / f"{task}{POLICY_SUFFIX}"
 
 
 def file_of(folder: Path, result: RunResult, name: str) -> Path | None:

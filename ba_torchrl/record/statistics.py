@@ -16,7 +16,7 @@ import numpy as np
 from scipy.integrate import trapezoid
 from scipy.stats import norm, sem, t
 
-from ba_torchrl.record.results import TestedPolicy
+from ba_torchrl.record.results import PolicyTest
 
 CONFIDENCE = 0.95
 UPPER = (1 + CONFIDENCE) / 2
@@ -40,7 +40,7 @@ def wilson(rate: float | np.ndarray, episodes: float | np.ndarray) -> Estimate:
     return Estimate(rate, low, np.where(rate >= 1, 1.0, (centre + half) / scale))
 
 
-def mean_success(tasks: Sequence[Sequence[TestedPolicy]]) -> Estimate:
+def mean_success(tasks: Sequence[Sequence[PolicyTest]]) -> Estimate:
     """Return the mean success over runs, and over tasks with equal weights, with its interval.
 
     The interval is never narrower than Wilson's for one run at the mean rate: all runs are tested
@@ -82,7 +82,7 @@ def mean_curve(rates: np.ndarray, episodes: np.ndarray) -> Estimate:
 
 
 def paired_difference(
-    tasks: Sequence[tuple[Sequence[TestedPolicy], Sequence[TestedPolicy]]],
+    tasks: Sequence[tuple[Sequence[PolicyTest], Sequence[PolicyTest]]],
 ) -> Estimate:
     """Return the mean difference of success, first minus second, with its interval.
 
@@ -138,7 +138,7 @@ def area_under_success(steps: Sequence[int], rates: Sequence[float], end: int) -
     return float(area / (end - steps[0]))
 
 
-def _by_scene(tests: Sequence[TestedPolicy]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _by_scene(tests: Sequence[PolicyTest]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return success rates, influences of scenes and episodes of scenes.
 
     An influence is the change of a run's rate by one more occurrence of a scene; those of a run

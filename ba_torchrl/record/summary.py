@@ -22,8 +22,8 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import (
     NON_LEARNING_FIELDS,
     CurvePoint,
+    PolicyTest,
     RunResult,
-    TestedPolicy,
     differences,
     flat,
     read_result,
@@ -142,12 +142,12 @@ class Group:
         return mean_success([self.tests])
 
     @property
-    def tests(self) -> list[TestedPolicy]:
+    def tests(self) -> list[PolicyTest]:
         """Tests of the last policies."""
         return [run.result.last for run in self.runs]
 
     @property
-    def by_seed(self) -> dict[int, TestedPolicy]:
+    def by_seed(self) -> dict[int, PolicyTest]:
         """Tests of the last policies by seed of the run."""
         return {run.result.seed: run.result.last for run in self.runs}
 

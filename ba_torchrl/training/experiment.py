@@ -19,7 +19,7 @@ from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.core import keys
 from ba_torchrl.demonstrations.episodes import mean_length, success_rate
 from ba_torchrl.record.logging import ScalarLog, progress_bar
-from ba_torchrl.record.results import CurvePoint, TestedPolicy
+from ba_torchrl.record.results import CurvePoint, PolicyTest, RunResult
 from ba_torchrl.training.checkpoint import (
     Checkpoints,
     ResumeState,
@@ -34,12 +34,11 @@ from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
 from ba_torchrl.training.learner import build_algorithm
 from ba_torchrl.training.outputs import (
-    Result,
     check_packages,
     expert_version,
     plot_curve,
     record_video,
-    write_record,
+    write_run_result,
 )
 from ba_torchrl.training.precision import compute_path, precision
 from ba_torchrl.training.protocol import run_test
@@ -97,7 +96,7 @@ class Experiment:
         self._last_save = time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 
-    def run(self) -> Result:
+    def run(self) -> RunResult:
         """Train, evaluate, and write curve, video and checkpoint into the run folder.
 
         Raises:
@@ -228,8 +227,8 @@ class Experiment:
             return False
         return all(point.success_rate >= target for point in last)
 
-    def _finish(self) -> Result:
-        """Test the last policy and the best checkpoint; write the record, then curve and video."""
+    def _finish(self) -> RunResult:
+        """Test the last policy and the best checkpoint; write the result, then curve and video."""
         config, state = self.config, self.state
         if not state.curve or state.curve[-1].updates < self.algorithm.updates:
             self._evaluate_and_save()
@@ -241,10 +240,10 @@ class Experiment:
             best = self._test()
             self.checkpoints.load(latest)
 
-        def write(**pictures: Path | None) -> Path:
+        def write(**pictures: Path | None) -> RunResult:
             state.add_time("other")
             files = {"checkpoint": latest, "best": best_checkpoint, **pictures}
-            return write_record(config, self.algorithm, last, best, state, files)
+            return write_run_result(config, self.algorithm, last, best, state, files)
 
         write()
         self._resume_state.remove()
@@ -253,8 +252,7 @@ class Experiment:
         with self._phase("video"):
             curve = self._picture("learning curve", lambda: plot_curve(config, state.curve))
             video = self._picture("video", lambda: record_video(config, self._greedy))
-        record = write(curve=curve, video=video)
-        return Result(last, best, latest, curve, video, record, state.total_seconds())
+        return write(curve=curve, video=video)
 
     def _picture(self, name: str, make: Callable[[], Path | None]) -> Path | None:
         """Return the file of a figure or film; None, with a warning, if it cannot be made."""
@@ -408,7 +406,7 @@ class Experiment:
             episodes = self.config.eval_episodes
             return evaluate(env, self._greedy, episodes, seed, lambda _: self._signals.check())
 
-    def _test(self) -> TestedPolicy:
+    def _test(self) -> PolicyTest:
         """Test the policy under the protocol."""
         updates, episodes = self.algorithm.updates, self.config.final_eval_episodes
         with self._evaluating() as env:

@@ -1,8 +1,7 @@
-"""Outputs of a finished run: learning curve, video and result record, in the run folder."""
+"""Outputs of a finished run: learning curve, video and result, in the run folder."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -15,8 +14,8 @@ from ba_torchrl.demonstrations.demo_files import recorded_expert
 from ba_torchrl.envs.policies import Policy
 from ba_torchrl.record.results import (
     CurvePoint,
+    PolicyTest,
     RunResult,
-    TestedPolicy,
     now,
     versions,
     write_result,
@@ -26,30 +25,6 @@ from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import record_episodes
 from ba_torchrl.training.protocol import PROTOCOL, count_parameters, test_seed
 from ba_torchrl.training.state import RunState
-
-
-@dataclass(frozen=True)
-class Result:
-    """The tests of a run's policies, and the files that it wrote."""
-
-    last: TestedPolicy
-    """The policy that training ended with."""
-    best: TestedPolicy
-    """The checkpoint with the best evaluation."""
-    checkpoint: Path
-    """Of the last policy."""
-    curve: Path | None
-    """None if it could not be drawn."""
-    video: Path | None
-    """None if the run wants none, or it could not be made."""
-    record: Path
-    """All of this and the whole curve as JSON; see `ba_torchrl.record.results`."""
-    seconds: float
-
-    @property
-    def updates(self) -> int:
-        """Updates of the last policy."""
-        return self.last.updates
 
 
 def check_packages(config: ExperimentConfig) -> None:
@@ -87,15 +62,15 @@ def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:
     return write_video(config.folder / "evaluation.mp4", frames, fps=config.resolved_env.video_fps)
 
 
-def write_record(
+def write_run_result(
     config: ExperimentConfig,
     algorithm: Learner,
-    last: TestedPolicy,
-    best: TestedPolicy,
+    last: PolicyTest,
+    best: PolicyTest,
     state: RunState,
     files: dict[str, Path | None],
-) -> Path:
-    """Write the run's result as JSON; return the file.
+) -> RunResult:
+    """Write the result of a run into its folder, and return it.
 
     Args:
         last: test of the policy that training ended with.
@@ -103,39 +78,38 @@ def write_record(
         files: the run's other files by name; None for one that was not written.
     """
     folder, task = config.folder.resolve(), config.resolved_env.task_class
-    return write_result(
-        config.folder,
-        RunResult(
-            protocol=PROTOCOL,
-            task=config.task,
-            task_version=task.version,
-            expert_version=state.expert_version,
-            label=config.label,
-            benchmark=config.benchmark,
-            seed=config.seed,
-            curve=state.curve,
-            last=last,
-            best=best,
-            demonstrations=state.demonstrations,
-            demonstration_steps=state.demonstration_steps,
-            env_steps=state.env_steps,
-            expert_labels=state.expert_labels,
-            precision=", then ".join(state.precisions),
-            parameters=count_parameters(algorithm.policy),
-            config=config.resolved(),
-            versions=versions(),
-            hardware=hardware(config.torch_device),
-            seconds=sum(state.phase_seconds.values()),
-            phase_seconds=state.phase_seconds,
-            resumed_at=state.resumed_at,
-            finished=now(),
-            files={
-                name: path.resolve().relative_to(folder).as_posix()
-                for name, path in files.items()
-                if path is not None
-            },
-        ),
+    result = RunResult(
+        protocol=PROTOCOL,
+        task=config.task,
+        task_version=task.version,
+        expert_version=state.expert_version,
+        label=config.label,
+        benchmark=config.benchmark,
+        seed=config.seed,
+        curve=state.curve,
+        last=last,
+        best=best,
+        demonstrations=state.demonstrations,
+        demonstration_steps=state.demonstration_steps,
+        env_steps=state.env_steps,
+        expert_labels=state.expert_labels,
+        precision=", then ".join(state.precisions),
+        parameters=count_parameters(algorithm.policy),
+        config=config.resolved(),
+        versions=versions(),
+        hardware=hardware(config.torch_device),
+        seconds=sum(state.phase_seconds.values()),
+        phase_seconds=state.phase_seconds,
+        resumed_at=state.resumed_at,
+        finished=now(),
+        files={
+            name: path.resolve().relative_to(folder).as_posix()
+            for name, path in files.items()
+            if path is not None
+        },
     )
+    write_result(config.folder, result)
+    return result
 
 
 def expert_version(config: ExperimentConfig) -> int | None:

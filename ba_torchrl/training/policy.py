@@ -1,6 +1,6 @@
 """Trained policies: loaded from a run, or from the files that the package ships.
 
-A policy in a file is ``NAME.safetensors``, its parameters, and ``NAME.json``, its `PolicyCard`.
+A policy in a file is ``NAME.safetensors``: its weights, and in the header the result of its test.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import shlex
 import textwrap
 from collections.abc import Iterable, Mapping
 from hashlib import sha256
-from importlib.resources import files
 from pathlib import Path
 from typing import Any, Literal
 
 import torch
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, ValidationError
 from safetensors import SafetensorError
 from safetensors.torch import load as load_tensors
+from safetensors.torch import save as save_tensors
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -27,22 +27,25 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import Interval, StrictModel, expanded, explain
+from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError, UnknownNameError, check_choice
-from ba_torchrl.core.files import atomic_output, json_bytes, write_tensors, write_text
+from ba_torchrl.core.files import atomic_file, errors_naming, header_texts, json_bytes
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.results import (
+    POLICY_RESULT,
+    POLICY_SUFFIX,
     RESULT_FILE,
+    Machine,
+    PolicyTest,
     RunResult,
-    TestedPolicy,
     now,
     read_result,
+    shipped_file,
     versions,
 )
-from ba_torchrl.record.statistics import wilson
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 from ba_torchrl.training.checkpoint import Which, find_checkpoint, load, parse_saved, read_versions
 from ba_torchrl.training.config import SET_BY_THE_EXPERIMENT, ExperimentConfig
@@ -52,7 +55,6 @@ from ba_torchrl.training.protocol import PROTOCOL, count_parameters
 
 logger = logging.getLogger(__name__)
 
-TENSORS, CARD = ".safetensors", ".json"
 _OF_TRAINING = {
     "logger": "csv",
     "collector": {"name": "single"},
@@ -60,70 +62,23 @@ _OF_TRAINING = {
     "demonstrations_mapping": None,
 }
 """Fields of a run that its policy does not need, with values that need no package or file."""
-
-
-_OF_RESULT = (
-    "expert_version",
-    "demonstrations",
-    "demonstration_steps",
-    "env_steps",
-    "expert_labels",
-    "hardware",
-    "versions",
-)
-"""Entries of a run's result that its policy's card has."""
-
+_COUNTS = ("demonstrations", "demonstration_steps", "env_steps", "expert_labels", "seconds")
+"""Entries of a run's result that the result of its policy has."""
 _OF_IMAGES = ("workspace", "in_hand_mode", "view_type", "view_scale")
 """Parameters of an environment that change the content of images and not their shape."""
 _WAY_OUT = "policy.make_env(), or a command without env.*, makes the environment of its training"
 
 
-class PolicyCard(StrictModel):
-    """What is known of a policy in a file."""
+class _Card(BaseModel, extra="ignore"):
+    """The file ``NAME.json`` that earlier versions wrote beside ``NAME.safetensors``."""
 
-    format: Literal[5] = 5
-    """1: kernels whose signs depended on the CPU. 2: no versions, and episodes of other seeds. 3: a
-    configuration of another form. 4: no checksum of the weights."""
+    format: Literal[5]
     policy_file: str
-    """SHA-256 of the file of the weights. Card and weights get their names one after the other, and
-    are copied separately."""
-    task: str
-    task_version: int
-    """Of the training and of the episodes."""
-    label: str
-    """Name of the method, such as "sacfd equi"."""
+    """SHA-256 of the other file."""
     config: dict[str, Any]
-    """The configuration of the run, from which the networks are built; without where it ran."""
     updates: int
-    """Gradient updates of the policy."""
-    success_rate: float
-    """Of the policy's test, whose record is exact."""
-    interval: Interval
-    """Wilson's interval of the success rate, 95 %."""
-    episodes: int
-    """Number of episodes of the test."""
-    protocol: int | None = None
-    """Version of the protocol of the test; None for one before protocol 1, which is not citable."""
-    precision: str | None = None
-    """Number format of the networks in the test."""
-    evaluate: str
-    """The command that plays the test again, in the folder of the file."""
+    task_version: int
     expert_version: int | None = None
-    """As in the run's result; None also if it is not known, likewise below."""
-    demonstrations: int | None = None
-    """Episodes of demonstrations."""
-    demonstration_steps: int | None = None
-    """Steps of these episodes."""
-    env_steps: int | None = None
-    """Environment steps of the run, demonstrations not counted."""
-    expert_labels: int | None = None
-    """States besides demonstrations that the expert labelled with its action."""
-    minutes: float | None = None
-    """Duration of the run."""
-    hardware: dict[str, Any] = Field(default_factory=dict)
-    """Machine of the run."""
-    versions: dict[str, str] = Field(default_factory=dict)
-    """Versions of Python and the packages in the run."""
 
 
 class TrainedPolicy(TensorDictModuleBase):
@@ -138,7 +93,7 @@ class TrainedPolicy(TensorDictModuleBase):
         updates: gradient updates of the policy.
         source: file or folder that it is from.
         versions: of the task and its expert in the training.
-        card: what is known of it, if it is from a file.
+        result: of its test, if it is from a file.
     """
 
     def __init__(
@@ -148,7 +103,7 @@ class TrainedPolicy(TensorDictModuleBase):
         updates: int,
         source: Path,
         versions: Versions,
-        card: PolicyCard | None = None,
+        result: RunResult | None = None,
     ) -> None:
         super().__init__()
         self.policy = learner.policy.requires_grad_(False)
@@ -159,8 +114,8 @@ class TrainedPolicy(TensorDictModuleBase):
         self.shapes = {key: known[key] for key in self.in_keys if key in known}
         """Shape of each image and vector that the policy reads, without batch dimensions."""
         self._warned: set[str] = set()
-        self.config, self.updates, self.source, self.card = config, updates, source, card
-        self.versions = versions
+        self.config, self.updates, self.source = config, updates, source
+        self.versions, self.result = versions, result
         self.eval()
 
     @property
@@ -277,8 +232,8 @@ def load_policy(
         its environment. A warning says if it was trained in another version of its task.
 
     Raises:
-        ConfigError: there is no such policy, its files are damaged or do not belong together, or it
-            names plugins that are neither imported nor installed.
+        ConfigError: there is no such policy, its files are damaged, or it names plugins that are
+            neither imported nor installed.
     """
     check_choice("which", which, Which)
     changes = {**_OF_TRAINING, "device": str(device), **changes}
@@ -292,33 +247,56 @@ def load_policy(
         if not path.exists():
             hint = f"; and there is no run folder and no file of a policy {source}"
             raise UnknownNameError("policy", str(source), shipped_policies(), hint)
-    if path.suffix != TENSORS:
+    if path.suffix != POLICY_SUFFIX:
         checkpoint = find_checkpoint(path, which)
         config, algorithm = load(checkpoint, **changes)
         versions = read_versions(checkpoint.parent.parent)
         _warn_of_version(config.task, versions)
         return TrainedPolicy(algorithm, config, algorithm.updates, checkpoint, versions)
-    card = read_card(path)
     try:
-        weights = path.read_bytes()
+        data = path.read_bytes()
+        result = read_result(path) if POLICY_RESULT in header_texts(path) else None
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
-    if sha256(weights).hexdigest() != card.policy_file:
-        raise DamagedFilesError(
-            f"{path} does not have the weights of its card, {path.with_suffix(CARD).name}: copy "
-            "both files again, or export the policy again"
-        )
+    known = result or _read_card(path)
+    if known.policy_file != (_digest(data) if result else sha256(data).hexdigest()):
+        raise DamagedFilesError(f"{path} was altered: it does not have the weights of its result")
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
-    config = parse_saved(card.config, path.with_suffix(CARD), **changes)
+    config = parse_saved(known.config, path, **changes)
     learner = build_to_load(config)
     try:
-        learner.policy.load_state_dict(load_tensors(weights))
+        learner.policy.load_state_dict(load_tensors(data))
     except (RuntimeError, SafetensorError) as error:
         reason = textwrap.shorten(str(error), 300)
-        raise ConfigError(f"{path} does not hold the policy of its card: {reason}") from None
-    versions = Versions(card.task_version, card.expert_version)
-    _warn_of_version(card.task, versions)
-    return TrainedPolicy(learner, config, card.updates, path, versions, card)
+        raise ConfigError(f"{path} does not hold the policy of its result: {reason}") from None
+    versions = Versions(known.task_version, known.expert_version)
+    _warn_of_version(config.task, versions)
+    return TrainedPolicy(learner, config, known.updates, path, versions, result)
+
+
+def _digest(data: bytes) -> str:
+    """Return the SHA-256 of the weights in a policy's file, which follow the header."""
+    return sha256(data[8 + int.from_bytes(data[:8], "little") :]).hexdigest()
+
+
+def _read_card(path: Path) -> _Card:
+    """Read the card of a policy that an earlier version wrote as two files."""
+    file = path.with_suffix(".json")
+    try:
+        card = _Card.model_validate_json(json_bytes(file))
+    except (OSError, ValidationError):
+        raise ConfigError(
+            f"{path} holds weights without the result of their policy: write the policy of a run "
+            "by `ba-torchrl export RUN`"
+        ) from None
+    logger.warning(
+        "%s and %s are of an earlier version: `ba-torchrl export %s path=NEW.safetensors` tests "
+        "the policy and writes one file",
+        path,
+        file.name,
+        path,
+    )
+    return card
 
 
 def _warn_of_version(task: str, trained: Versions) -> None:
@@ -341,134 +319,85 @@ def round_weights(policy: TrainedPolicy) -> None:
             value.copy_(value.half())
 
 
-def save_policy(policy: TrainedPolicy, path: str | Path, test: TestedPolicy) -> PolicyCard:
-    """Write a policy and its card. Weights are stored in half precision.
-
-    Args:
-        policy: from a run, after `round_weights`.
-        path: ends in ``.safetensors``; the card is beside it.
-        test: of this very policy, under the protocol.
-
-    Raises:
-        ConfigError: another process writes the file, or it was trained in another version of its
-            task.
-        OSError: there is not enough space, or a file cannot be written.
-    """
-    path = Path(path)
-    if policy.versions.task != versions_of(policy.task).task:
+def check_version(policy: TrainedPolicy) -> None:
+    """Raise `ConfigError` if a policy was trained in another version of its task."""
+    here = versions_of(policy.task).task
+    if policy.versions.task != here:
         raise ConfigError(
             f"the policy was trained in version {policy.versions.task} of {policy.task}, and its "
-            f"episodes are of version {versions_of(policy.task).task}: train it again"
+            f"episodes are of version {here}: train it again"
         )
-    run: dict[str, Any] = {"expert_version": policy.versions.expert}
-    folder = policy.source.parent.parent
-    if (folder / RESULT_FILE).exists():
-        result = read_result(folder)
-        run = {
-            "minutes": round(result.seconds / 60, 1),
-            **{name: getattr(result, name) for name in _OF_RESULT},
-        }
-    config = policy.config.resolved()
-    for name in ("run_dir", "resume", "device", *_OF_TRAINING):
-        del config[name]
-    is_shipped = path.resolve() == shipped_file(policy.task)
-    source = policy.task if is_shipped else path.name
-    words = [f"policy={source}", f"episodes={test.episodes}"]
-    if policy.config.plugins:
-        words.append(f"plugins=[{','.join(policy.config.plugins)}]")
-    tensors = {name: value.detach().cpu() for name, value in policy.policy.state_dict().items()}
-    with atomic_output(path, replace=True) as scratch:
-        write_tensors(
-            scratch,
-            {
-                name: value.half() if value.is_floating_point() else value.clone()
-                for name, value in tensors.items()
-            },
-        )
-        scratch.chmod(0o644)  # safetensors makes it readable for its owner alone
-        card = PolicyCard(
-            policy_file=sha256(scratch.read_bytes()).hexdigest(),
-            task=policy.task,
-            task_version=policy.versions.task,
-            label=policy.config.label,
-            config=config,
-            updates=policy.updates,
-            **_of_test(test, PROTOCOL, precision(policy.config)),
-            evaluate=shlex.join(["ba-torchrl", "evaluate", *words]),
-            **run,
-        )
-        write_text(scratch.with_suffix(CARD), card.model_dump_json(indent=2) + "\n")
-    return card
 
 
-def _of_test(test: TestedPolicy, protocol: int, precision: str) -> dict[str, Any]:
-    """Return the fields of a card that a test determines."""
-    return {
-        "success_rate": test.success_rate,
-        "interval": tuple(map(float, wilson(test.success_rate, test.episodes)[1:])),
-        "episodes": test.episodes,
-        "protocol": protocol,
-        "precision": precision,
+def save_policy(policy: TrainedPolicy, path: str | Path, test: PolicyTest) -> RunResult:
+    """Write a policy and the result of its test into one file. Weights are in half precision.
+
+    Args:
+        policy: after `round_weights`, or from such a file.
+        path: ends in ``.safetensors``; an older file is replaced when the new one is complete.
+        test: of this very policy, under the protocol, on this machine.
+
+    Raises:
+        OSError: there is not enough space, or the file cannot be written.
+    """
+    path = Path(path)
+    tensors = {
+        name: value.detach().to("cpu", torch.half if value.is_floating_point() else None, copy=True)
+        for name, value in policy.policy.state_dict().items()
     }
+    result = _result(policy, test, _digest(save_tensors(tensors)))
+    data = save_tensors(tensors, {POLICY_RESULT: result.model_dump_json()})
+    with errors_naming(path), atomic_file(path) as scratch:
+        scratch.write_bytes(data)
+    return result
 
 
-def tested_card(card: PolicyCard, record: RunResult) -> PolicyCard:
-    """Return a card with the number of the record of its policy's test."""
-    found = _of_test(record.last, record.protocol, record.precision)
-    episodes = f"episodes={record.last.episodes}"
-    command = card.evaluate.replace(f"episodes={card.episodes}", episodes)
-    return card.model_copy(update={**found, "evaluate": command})
-
-
-def policy_result(policy: TrainedPolicy, test: TestedPolicy) -> RunResult:
-    """Return the record of the test of a policy from a file, on this machine."""
-    config, card = policy.config, policy.card
+def _result(policy: TrainedPolicy, test: PolicyTest, digest: str) -> RunResult:
+    """Return the result of the test of a policy on this machine."""
+    config, known, run = policy.config, policy.result, policy.source.parent.parent
+    trained_on = known and known.trained_on
+    if policy.source.is_dir() and (run / RESULT_FILE).exists():
+        known = read_result(run)
+        trained_on = Machine(hardware=known.hardware, versions=known.versions)
     settings = config.resolved()
     for name in ("run_dir", "resume", "device"):
         del settings[name]
     return RunResult(
         protocol=PROTOCOL,
         task=policy.task,
-        task_version=config.resolved_env.task_class.version,
-        expert_version=card.expert_version,
-        label=card.label,
+        task_version=versions_of(policy.task).task,
+        expert_version=known.expert_version if known else policy.versions.expert,
+        label=config.label,
         benchmark=config.benchmark,
         seed=config.seed,
         curve=[],
         last=test,
         best=test,
-        policy_file=card.policy_file,
-        demonstrations=card.demonstrations,
-        demonstration_steps=card.demonstration_steps,
-        env_steps=card.env_steps,
-        expert_labels=card.expert_labels,
+        policy_file=digest,
+        trained_on=trained_on,
+        **{name: getattr(known, name, None) for name in _COUNTS},
         precision=precision(config),
         parameters=count_parameters(policy.policy),
         config=settings,
         versions=versions(),
         hardware=hardware(config.torch_device),
-        seconds=None if card.minutes is None else 60 * card.minutes,
         phase_seconds={},
         finished=now(),
         files={},
     )
 
 
-def read_card(path: str | Path) -> PolicyCard:
-    """Read the card of a policy's file."""
-    file = Path(path).with_suffix(CARD)
-    try:
-        return PolicyCard.model_validate_json(json_bytes(file))
-    except OSError as error:
-        raise ConfigError(f"cannot read {file}: {error.strerror}") from None
-    except ValidationError as error:
-        found = explain(error, PolicyCard, "card")
-        raise ConfigError(f"this version cannot use {file}: {found}") from None
+def evaluate_command(source: str | Path, result: RunResult) -> str:
+    """Return the command that plays the test of a policy again.
 
-
-def shipped_file(task: str) -> Path:
-    """Return the file in which the package ships the policy of a task."""
-    return Path(str(files("ba_torchrl"))) / "policies" / f"{task}{TENSORS}"
+    Args:
+        source: the policy's file, or the task whose policy it is that the package ships.
+        result: of the policy.
+    """
+    words = [f"policy={source}", f"episodes={result.last.episodes}"]
+    if plugins := result.config.get("plugins"):
+        words.append(f"plugins=[{','.join(plugins)}]")
+    return shlex.join(["ba-torchrl", "evaluate", *words])
 
 
 def shipped_policies() -> list[str]:

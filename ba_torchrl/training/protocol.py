@@ -21,7 +21,7 @@ from ba_torchrl.core.config import PROTOCOL as PROTOCOL
 from ba_torchrl.demonstrations.episodes import is_success, play_seeds
 from ba_torchrl.envs.checks import check_policy
 from ba_torchrl.envs.policies import Policy
-from ba_torchrl.record.results import TestedPolicy
+from ba_torchrl.record.results import PolicyTest
 
 TEST_EPISODES = 500
 """Episodes of a number that is cited."""
@@ -41,7 +41,7 @@ def run_test(
     episodes: int = TEST_EPISODES,
     on_episode: Callable[[TensorDict], None] | None = None,
     first_seed: int = FIRST_TEST_SEED,
-) -> TestedPolicy:
+) -> PolicyTest:
     """Play the first episodes of a test greedily; the weights stay constant.
 
     The result does not depend on the environments' number and processes: the policy acts on batches
@@ -59,7 +59,7 @@ def run_test(
     seeds = [first_seed + episode for episode in range(episodes)]
     with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
         played = play_seeds(env, _in_batches(policy), seeds, on_episode)
-    return TestedPolicy(
+    return PolicyTest(
         updates=updates,
         seeds=seeds,
         successes=[int(is_success(episode)) for episode in played],

@@ -140,7 +140,7 @@ def test_types_of_settings(kind, right, wrong, monkeypatch, tmp_path):
 
 
 NO_PATHS = {
-    *("Source.source", "PolicyCard.policy_file", "RunResult.policy_file", "PolicyCard.evaluate"),
+    *("Source.source", "RunResult.policy_file"),
     *("BenchmarkConfig.algorithms", "BenchmarkConfig.networks"),
 }
 """Fields whose descriptions speak of files: names in them, names of presets, checksums."""

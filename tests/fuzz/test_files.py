@@ -153,7 +153,7 @@ def test_results(tmp_path, count):
         for name in ("result.json", "failure.json"):
             (run / name).write_bytes(data)
         run_folders([tmp_path])
-        with pytest.raises(ValueError, match="is not the result of a run"):
+        with pytest.raises(ValueError, match="has no valid result"):
             read_result(run)
 
     check(count, st.one_of(st.binary(max_size=40), JSON), prop)

@@ -2,7 +2,9 @@
 
 import re
 
+import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from ba_torchrl import list_tasks
 from ba_torchrl.commands import leaderboard as command
@@ -32,12 +34,11 @@ def make_run(folder, rate=0.9, **changes):
 
 
 @pytest.fixture
-def records(tmp_path, monkeypatch):
-    """Return an empty folder in the place of the package's records."""
-    folder = tmp_path / "records"
+def shipped(tmp_path, monkeypatch):
+    """Return an empty folder in the place of the shipped policies."""
+    folder = tmp_path / "policies"
     folder.mkdir()
-    monkeypatch.setattr(boards, "RECORDS", folder)
-    monkeypatch.setattr(page, "RECORDS", folder)
+    monkeypatch.setattr(boards, "POLICIES", folder)
     monkeypatch.setattr(page, "FOLDER", tmp_path / "questions")
     (tmp_path / "questions/mine").mkdir(parents=True)
     return folder
@@ -87,7 +88,7 @@ def test_own_runs_are_beside_those_of_the_package(tmp_path):
         leaderboard([], [packaged, own], [REACH], protocol=1)
 
 
-@pytest.mark.usefixtures("records")
+@pytest.mark.usefixtures("shipped")
 def test_the_command_prints_the_table(tmp_path, capsys):
     make_run(tmp_path / "runs/a", label="my method")
     make_run(tmp_path / "runs/b", label="older", protocol=0)
@@ -99,47 +100,37 @@ def test_the_command_prints_the_table(tmp_path, capsys):
     assert re.search(rf"^\| {PICK}  +\| –  +\| –  +\|$", text, flags=re.MULTILINE)
     assert "older, seed 0" in text
     assert f"- {tmp_path / 'runs/c'}: interrupted" in text
-    command.COMMAND.run([])  # no records
+    command.COMMAND.run([])  # no policies
     text = capsys.readouterr().out
     assert all(f"\n| {task} " in text for task in list_tasks())
 
 
-def test_the_page_of_results_is_made_from_the_records(tmp_path, records):
+def test_the_page_of_results_is_made_from_the_shipped_policies(tmp_path, shipped):
     tasks = [task for task in TASKS if TASKS.plugin_module(task) is None]
     assert len(re.findall(r"^\| `", page.page_with_results(ALL_TASKS), flags=re.MULTILINE)) == len(
         tasks
     )
+    machine = {"hardware": {"cpu": "Old CPU"}, "versions": {"commit": "0ld"}}
+    of_file = {"policy_file": "0f", "trained_on": machine, "curve": [], "seconds": None}
     for seed in range(2):
-        make_run(tmp_path / f"runs/{seed}", seed=seed)
-    assert page.add([str(tmp_path / "runs")]) == 2
-    make_run(tmp_path / "runs/other", config={"env": {"robot": "ur5"}})
-    with pytest.raises(ValueError, match=r"runs/0 and .*runs/other are both .*_seed0\.json"):
-        page.add([str(tmp_path / "runs")])
-    file = make_run(tmp_path / "file", policy_file="0f", task=PICK, curve=[], env_steps=None)
-    file = file.result.model_copy(update={"seconds": None})
-    (records / "trained.json").write_text(file.model_dump_json())
-    assert sorted(path.name for path in records.iterdir()) == [
-        "close_loop_block_reaching_sacfd_equi_seed0.json",
-        "close_loop_block_reaching_sacfd_equi_seed1.json",
-        "trained.json",
-    ]
+        run = make_run(tmp_path / f"{seed}", seed=seed, **of_file, env_steps=None)
+        texts = {"result": run.result.model_dump_json()}
+        save_file({"weights": np.zeros(2)}, shipped / f"{seed}.safetensors", texts)
     text = page.page_with_results(ALL_TASKS).replace("\N{NO-BREAK SPACE}", " ")
-    rows = re.findall(r"^\| `close_loop/block_(?:reaching|picking)` .*", text, flags=re.MULTILINE)
-    assert [row.split(" | ")[2:] for row in rows] == [
-        ["sacfd equi (policy from a file)", "0.90 (0.85 to 0.93) 1×200*", "6.0", "–", "– |"],
-        ["sacfd equi (policy of a run)", rows[1].split(" | ")[3], "6.0", "1500", "33 |"],
-    ]
-    assert "2×200*" in rows[1]
+    (row,) = re.findall(r"^\| `close_loop/block_reaching` .*", text, flags=re.MULTILINE)
+    assert row.split(" | ")[2::2] == ["sacfd equi", "6.0", "– |"]
+    assert "2×200*" in row
+    assert "Trained on Old CPU: 2 policies; commits: 0ld." in text
     assert "Processors: Some CPU; commits: abc." in text
 
 
-def test_the_records_of_a_question_are_compared(tmp_path, records):
+@pytest.mark.usefixtures("shipped")
+def test_the_results_of_a_question_are_compared(tmp_path):
     for seed in range(2):
         for rate, label in ((0.9, "first"), (0.4, "second")):
             name = f"runs/{label}{seed}"
             make_run(tmp_path / name, rate, seed=seed, label=label, benchmark="mine")
     assert page.add([str(tmp_path / "runs")]) == 4
-    assert not list(records.iterdir())
     text = page.page_with_results(QUESTION)
     assert "results/mine.svg" in text
     first, second, difference = re.findall(rf"^\| `{REACH}` .*", text, flags=re.MULTILINE)
@@ -149,3 +140,9 @@ def test_the_records_of_a_question_are_compared(tmp_path, records):
     assert names[1:] == ["first", "second", "2"]
     assert (area.split(" ")[0], last.split(" ")[0]) == ("+0.13", "+0.50")
     assert difference.endswith("direction only |")
+    make_run(tmp_path / "runs/other", 0.1, label="first", benchmark="mine", env_steps=7)
+    with pytest.raises(ValueError, match=r"runs/first0 and .*runs/other are both .*_seed0\.json"):
+        page.add([str(tmp_path / "runs")])
+    make_run(tmp_path / "alone")
+    with pytest.raises(ValueError, match=r"alone is no run of a question: there is no .*/None"):
+        page.add([str(tmp_path / "alone")])

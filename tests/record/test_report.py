@@ -18,8 +18,8 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import (
+    PolicyTest,
     RunResult,
-    TestedPolicy,
     differences,
     read_result,
     versions,
@@ -61,7 +61,7 @@ def policy_test(rate, seed=0, episodes=10):
     outcomes = [1] * successes + [0] * (episodes - successes)
     lengths = [6 + seed] * episodes
     seeds = range(FIRST_TEST_SEED, FIRST_TEST_SEED + episodes)
-    return TestedPolicy(updates=300, seeds=seeds, successes=outcomes, lengths=lengths)
+    return PolicyTest(updates=300, seeds=seeds, successes=outcomes, lengths=lengths)
 
 
 RESULT = {
@@ -372,7 +372,7 @@ def test_a_run_of_somebody_else_imports_and_copies_nothing_from_outside_its_fold
     tmp_path, monkeypatch, caplog
 ):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ba_torchrl.record.leaderboard.RECORDS", tmp_path / "none")
+    monkeypatch.setattr("ba_torchrl.record.leaderboard.POLICIES", tmp_path / "none")
     Path("evil.py").write_text("open('CODE_RAN', 'w')")
     Path("secret.mp4").write_text("secret")
     config = {"plugins": ["evil"]}

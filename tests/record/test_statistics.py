@@ -127,6 +127,13 @@ def test_a_single_run_has_the_interval_of_wilson():
     assert found[1:] == pytest.approx(wilson_interval(9, 10))
 
 
+def test_scenes_are_never_fewer_episodes_than_their_number():
+    """The design effect would leave 2.67 episodes of three scenes, one of which is played twice."""
+    _, low, high = mean_success([runs([[1, 1, 0, 0]], seeds=[1, 1, 2, 3])])
+    expected = wilson(0.5, 3)
+    assert (low, high) == pytest.approx((expected.low.item(), expected.high.item()))
+
+
 def test_no_interval_is_narrower_than_that_of_one_run():
     outcomes = np.tile(np.arange(50) < 45, (8, 1))
     value, low, high = mean_success([runs(outcomes)])

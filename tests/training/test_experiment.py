@@ -18,7 +18,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.demonstrations.demo_files import save_demonstrations
 from ba_torchrl.demonstrations.exchange import export_demonstrations
 from ba_torchrl.record.logging import read_scalars
-from ba_torchrl.record.results import Phase, TestedPolicy, read_result
+from ba_torchrl.record.results import Phase, PolicyTest, read_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import protocol
 from ba_torchrl.training.checkpoint import Checkpoints, find_checkpoint, load
@@ -66,8 +66,8 @@ def test_a_run_writes_its_files(tmp_path):
     result = Experiment(tiny(tmp_path), progress=False).run()
     folder = tmp_path / "run"
     assert result.last.episodes == 4
-    assert result.curve.read_bytes().startswith(b"\x89PNG")
-    assert result.video.stat().st_size > 1000
+    assert (folder / result.files["curve"]).read_bytes().startswith(b"\x89PNG")
+    assert (folder / result.files["video"]).stat().st_size > 1000
     assert json.loads((folder / "config.json").read_text())["task"] == TINY["task"]
     scalars = read_scalars(folder)
     assert scalars["eval/success_rate"].steps.tolist() == [0, 3, 6]
@@ -137,7 +137,7 @@ def test_the_last_policy_and_the_best_checkpoint_are_tested(tmp_path, monkeypatc
     def run_test(env, policy, updates, episodes, on_episode):
         note()
         seeds = [protocol.test_seed(episode) for episode in range(episodes)]
-        return TestedPolicy(
+        return PolicyTest(
             updates=updates, seeds=seeds, successes=[1] * episodes, lengths=[updates] * episodes
         )
 
@@ -145,14 +145,12 @@ def test_the_last_policy_and_the_best_checkpoint_are_tested(tmp_path, monkeypatc
     monkeypatch.setattr("ba_torchrl.training.experiment.run_test", run_test)
     result = experiment.run()
     assert (result.last.updates, result.best.updates) == (6, 3)
-    assert result.checkpoint.name.endswith("6")
+    assert [result.files[name][-1] for name in ("checkpoint", "best")] == ["6", "3"]
     assert torch.equal(weights[3], weights[2])
     assert torch.equal(weights[4], weights[1])
     assert not torch.equal(weights[2], weights[1])
     assert torch.equal(next(experiment.algorithm.loss.parameters()), weights[2])
-    record = read_result(tmp_path / "run")
-    assert (record.last, record.best) == (result.last, result.best)
-    assert record.files["best"].endswith("3")
+    assert read_result(tmp_path / "run") == result
 
 
 @pytest.mark.parametrize(
@@ -167,19 +165,19 @@ def test_a_result_counts_what_the_run_used(tmp_path, changes, labels, expert):
     config = tiny(tmp_path, video_episodes=0, **changes)
     experiment = Experiment(config, progress=False)
     experiment.run()
-    record = read_result(config.folder)
-    assert (record.protocol, record.task_version, record.expert_version) == (1, 0, expert)
-    assert record.demonstrations == config.demonstrations
-    assert (record.demonstration_steps >= 3) == bool(config.demonstrations)
-    assert record.expert_labels == labels
-    assert record.env_steps == record.curve[-1].env_steps
-    assert record.precision == precision(config)
+    result = read_result(config.folder)
+    assert (result.protocol, result.task_version, result.expert_version) == (1, 0, expert)
+    assert result.demonstrations == config.demonstrations
+    assert (result.demonstration_steps >= 3) == bool(config.demonstrations)
+    assert result.expert_labels == labels
+    assert result.env_steps == result.curve[-1].env_steps
+    assert result.precision == precision(config)
     policy = experiment.algorithm.policy
-    assert record.parameters == sum(value.numel() for value in policy.parameters()) > 0
-    assert record.last.seeds == [protocol.test_seed(episode) for episode in range(4)]
-    assert set(record.phase_seconds) == set(get_args(Phase))
-    assert record.seconds == pytest.approx(sum(record.phase_seconds.values()))
-    used = {name for name, seconds in record.phase_seconds.items() if seconds > 1e-3}
+    assert result.parameters == sum(value.numel() for value in policy.parameters()) > 0
+    assert result.last.seeds == [protocol.test_seed(episode) for episode in range(4)]
+    assert set(result.phase_seconds) == set(get_args(Phase))
+    assert result.seconds == pytest.approx(sum(result.phase_seconds.values()))
+    used = {name for name, seconds in result.phase_seconds.items() if seconds > 1e-3}
     assert used >= {"updates", "evaluation", "collection", "other"}
     assert ("demonstrations" in used) == bool(config.demonstrations)
 
@@ -325,10 +323,9 @@ def test_a_run_whose_figures_fail_is_finished(tmp_path, monkeypatch, caplog):
     changes = {**SHORT, "video_episodes": 1, "label": "$a_{$ costs"}
     with matplotlib.rc_context({"text.usetex": True, "font.family": "none", "figure.dpi": -1}):
         result = Experiment(tiny(tmp_path, **changes), progress=False).run()
-    assert written == [{"checkpoint", "best"}]  # the record is first
-    assert read_result(tmp_path / "run").files.keys() == {"checkpoint", "best", "curve"}
-    assert result.curve.read_bytes().startswith(b"\x89PNG")
-    assert result.video is None
+    assert written == [{"checkpoint", "best"}]  # the result is first
+    assert result.files.keys() == {"checkpoint", "best", "curve"}
+    assert (tmp_path / "run" / result.files["curve"]).read_bytes().startswith(b"\x89PNG")
     assert "run has no video: OSError: no space for a film" in caplog.text
     assert not (tmp_path / "run/resume").exists()
 

@@ -189,9 +189,9 @@ def test_a_run_that_was_killed_counts_each_label_once(tmp_path):
     with pytest.raises(Killed):
         experiment.run()
     assert_same(run(config), whole)
-    record = read_result(tmp_path / "run")
-    assert record.resumed_at == [10]
-    assert record.seconds == pytest.approx(sum(record.phase_seconds.values()))
+    result = read_result(tmp_path / "run")
+    assert result.resumed_at == [10]
+    assert result.seconds == pytest.approx(sum(result.phase_seconds.values()))
 
 
 @pytest.mark.parametrize("evaluation", [3, *slow([1, 2])])

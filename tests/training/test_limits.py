@@ -6,14 +6,14 @@ import os
 
 import numpy as np
 import pytest
-import torch
 
 import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE
 from ba_torchrl.cli.errors import plain_errors
-from ba_torchrl.core.files import atomic_output, write_tensors, write_text
+from ba_torchrl.core.files import write_text
 from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.video import write_video
+from ba_torchrl.training import policy as policies
 from tests.training.test_resume import config_for, interrupt, run
 
 resource = pytest.importorskip("resource")
@@ -52,9 +52,9 @@ def noise(frames=6):
     return np.random.default_rng(0).integers(0, 255, (frames, 96, 96, 3), np.uint8)
 
 
-def save_noise(path):
-    with atomic_output(path, replace=True) as scratch:
-        write_tensors(scratch, {"noise": torch.tensor(noise())})
+def save_policy(path):
+    policy = ba_torchrl.load_policy("close_loop/block_picking")
+    policies.save_policy(policy, path, policy.result.last)
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def save_noise(path):
             lambda path: plot_panels({"a": {"b": Learning(((0, 1), (0, 1)))}}, [path], names="b"),
         ),
         ("page.md", lambda path: write_text(path, 10_000 * "x")),
-        ("policy.safetensors", save_noise),
+        ("policy.safetensors", save_policy),
     ],
 )
 def test_a_file_that_cannot_be_written_leaves_the_one_before(name, write, tmp_path, capfd):

@@ -1,7 +1,6 @@
-"""Trained policies: from a run, in a file with its card, and shipped."""
+"""Trained policies: from a run, in a file with its result, and shipped."""
 
 import json
-import os
 import re
 import shlex
 import shutil
@@ -11,18 +10,21 @@ from hashlib import sha256
 
 import pytest
 import torch
+from safetensors.torch import load, save
 from tensordict import TensorDict
 from torchrl.envs import StepCounter, TransformedEnv
 
 import ba_torchrl
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.record.results import RunResult, TestedPolicy, read_result
+from ba_torchrl.core.files import header_texts
+from ba_torchrl.record.results import PolicyTest, read_result
+from ba_torchrl.record.statistics import mean_success
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training import evaluation, protocol
 from ba_torchrl.training import policy as policies
-from ba_torchrl.training.checkpoint import load
+from ba_torchrl.training.checkpoint import load as load_checkpoint
 from ba_torchrl.training.experiment import Experiment
-from docs import shipped as shipped_records
+from docs import shipped as shipped_results
 from tests.recipes import recipe
 from tests.training.test_experiment import tiny
 
@@ -39,7 +41,7 @@ def with_outcomes(*successes):
     """A test with these outcomes."""
     seeds = list(map(protocol.test_seed, range(len(successes))))
     lengths = [7] * len(successes)
-    return TestedPolicy(updates=6, seeds=seeds, successes=successes, lengths=lengths)
+    return PolicyTest(updates=6, seeds=seeds, successes=successes, lengths=lengths)
 
 
 def observed(policy):
@@ -59,7 +61,7 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
     assert not first["action"].requires_grad
     assert not policy.training
     torch.testing.assert_close(first["action"], second["action"], rtol=0, atol=0)
-    config, _ = load(run)
+    config, _ = load_checkpoint(run)
     env = policy.make_env()
     assert env.config.model_copy(update={"seed": None}) == config.resolved_env.config
     env.rollout(2, policy)
@@ -168,18 +170,17 @@ def test_a_policy_of_another_version_of_its_task_is_said_and_not_exported(
     run, tmp_path, monkeypatch, caplog
 ):
     policy, path = ba_torchrl.load_policy(run), tmp_path / "p.safetensors"
-    test = with_outcomes(1)
     monkeypatch.setattr(TASKS[policy.task], "expert_version", 3)
-    card = policies.save_policy(policy, path, test)
-    assert (card.task_version, card.expert_version) == (0, 0)
+    result = policies.save_policy(policy, path, with_outcomes(1))
+    assert (result.task_version, result.expert_version) == (0, 0)
     assert not caplog.records
     monkeypatch.setattr(TASKS[policy.task], "version", 1)
     for source in (run, path):
-        ba_torchrl.load_policy(source)
+        policy = ba_torchrl.load_policy(source)
+        with pytest.raises(ConfigError, match="its episodes are of version 1: train it again"):
+            policies.check_version(policy)
     start = f"the policy was trained in version 0 of {policy.task}, which has version 1 here"
     assert [message.startswith(start) for message in caplog.messages] == [True, True]
-    with pytest.raises(ConfigError, match="its episodes are of version 1: train it again"):
-        policies.save_policy(policy, path, test)
 
 
 def test_any_batch_shape_is_taken(shipped):
@@ -213,24 +214,33 @@ def test_a_file_acts_like_the_run(run, tmp_path):
     for weight, before in zip(policy.policy.state_dict().values(), trained, strict=True):
         torch.testing.assert_close(weight, before, rtol=2**-11, atol=2**-25)
     path = tmp_path / "p.safetensors"
-    card = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
+    result = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
+    assert list(tmp_path.iterdir()) == [path]
     again = ba_torchrl.load_policy(path)
     state = observed(policy)
     torch.testing.assert_close(
         again(state.clone())["action"], policy(state.clone())["action"], rtol=0, atol=0
     )
-    assert again.card == card
-    assert (card.success_rate, card.episodes, card.protocol) == (0.75, 4, 1)
+    assert again.result == read_result(path) == result
+    assert (result.last, result.best, result.protocol) == (*2 * [with_outcomes(1, 1, 0, 1)], 1)
     command = "ba-torchrl evaluate policy=p.safetensors episodes=4"
-    assert card.evaluate == command
-    policy.config = policy.config.model_copy(update={"plugins": ["mine", "yours.nets"]})
-    with_plugins = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
-    assert with_plugins.evaluate == f"{command} 'plugins=[mine,yours.nets]'"
-    result = read_result(run)
-    for name in ("env_steps", "demonstrations", "expert_labels", "expert_version"):
-        assert getattr(card, name) == getattr(result, name), name
+    assert policies.evaluate_command(path.name, result) == command
+    result.config["plugins"] = ["mine", "yours.nets"]
+    command += " 'plugins=[mine,yours.nets]'"
+    assert policies.evaluate_command(path.name, result) == command
+    trained = read_result(run)
+    assert (result.trained_on.hardware, result.trained_on.versions) == (
+        trained.hardware,
+        trained.versions,
+    )
+    copy = policies.save_policy(again, tmp_path / "copy.safetensors", with_outcomes(0))
+    assert copy.policy_file == result.policy_file
+    assert (copy.last, copy.trained_on) == (with_outcomes(0), result.trained_on)
+    for found in (result, copy):
+        for name in ("env_steps", "demonstrations", "expert_labels", "expert_version", "seconds"):
+            assert getattr(found, name) == getattr(trained, name), name
     assert again.env_config == policy.env_config
-    assert str(run) not in path.with_suffix(".json").read_text()
+    assert str(run).encode() not in path.read_bytes()
 
 
 def test_what_is_no_policy_is_named(run, tmp_path):
@@ -242,14 +252,14 @@ def test_what_is_no_policy_is_named(run, tmp_path):
         ba_torchrl.load_policy("close_loop/block_pickng")
     path = tmp_path / "p.safetensors"
     path.touch()
-    with pytest.raises(ConfigError, match=r"cannot read .*p.json"):
+    with pytest.raises(ConfigError, match=r"p.safetensors is not a whole safetensors file"):
         ba_torchrl.load_policy(path)
     policies.save_policy(ba_torchrl.load_policy(run), path, with_outcomes(1))
-    card = path.with_suffix(".json")
-    saved = json.loads(card.read_text())
+    saved, whole = json.loads(read_result(path).model_dump_json()), path.read_bytes()
+    weights = load(whole)
 
     def loaded(**changes):
-        card.write_text(json.dumps({**saved, **changes}))
+        path.write_bytes(save(weights, {"result": json.dumps({**saved, **changes})}))
         return ba_torchrl.load_policy(path)
 
     for elsewhere in (
@@ -261,43 +271,88 @@ def test_what_is_no_policy_is_named(run, tmp_path):
     with pytest.raises(ConfigError, match=r"uses the plugins \[antigravity\].*runs their code"):
         loaded(config={**saved["config"], "plugins": ["antigravity"]})
     assert "antigravity" not in sys.modules
-    with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*unknown .*'new'"):
+    with pytest.raises(
+        ConfigError, match=r"(?s)this version cannot use .*p.safetensors.*unknown .*'new'"
+    ):
         loaded(config={**saved["config"], "new": 1})
-    with pytest.raises(ConfigError, match=r"(?s)this version cannot use .*p.json.*format: "):
+    with pytest.raises(ConfigError, match=r"p.safetensors has no valid result: format"):
         loaded(format=1)
     wider = {**saved["config"]["network"], "width": 2 * saved["config"]["network"]["width"]}
-    with pytest.raises(ConfigError, match="does not hold the policy of its card"):
+    with pytest.raises(ConfigError, match="does not hold the policy of its result"):
         loaded(config={**saved["config"], "network": wider})
     loaded()
-    path.write_bytes(path.read_bytes()[:-100])
-    with pytest.raises(ConfigError, match=r"weights of its card, p.json: copy both"):
-        ba_torchrl.load_policy(path)
+    for altered, reason in (
+        (whole[:-100], "is not a whole safetensors file"),
+        (whole[:-1] + bytes([whole[-1] ^ 1]), "was altered: it does not have the weights"),
+        (save(weights), "weights without the result of their policy: .* `ba-torchrl export RUN`"),
+    ):
+        path.write_bytes(altered)
+        with pytest.raises(ConfigError, match=reason):
+            ba_torchrl.load_policy(path)
 
 
-def test_weights_and_card_of_two_exports_are_told_apart(run, tmp_path, monkeypatch):
-    """The process ends between the two renames, or somebody copies one file."""
+def test_an_export_that_stops_leaves_the_policy_before(run, tmp_path, monkeypatch):
     path, policy = tmp_path / "p.safetensors", ba_torchrl.load_policy(run)
     policies.save_policy(policy, path, with_outcomes(1))
+    before = path.read_bytes()
     next(iter(policy.policy.parameters())).add_(1)
 
-    def replace(source, target, replace=os.replace):
-        if source.suffix == policies.TENSORS:
-            raise KeyboardInterrupt
-        replace(source, target)
+    def stop(*_):
+        raise KeyboardInterrupt
 
-    monkeypatch.setattr("ba_torchrl.core.files.os.replace", replace)
+    monkeypatch.setattr("ba_torchrl.core.files.os.replace", stop)
     with pytest.raises(KeyboardInterrupt):
         policies.save_policy(policy, path, with_outcomes(0))
-    assert policies.read_card(path).success_rate == 0
-    with pytest.raises(ConfigError, match="does not have the weights of its card"):
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_two_files_of_an_earlier_version_are_loaded_and_the_command_that_converts_is_said(
+    tmp_path, caplog
+):
+    shipped = ba_torchrl.load_policy("close_loop/block_picking")
+    path, file = tmp_path / "old.safetensors", tmp_path / "old.json"
+    path.write_bytes(save(load(policies.shipped_file(shipped.task).read_bytes())))
+    card = {
+        "format": 5,
+        "policy_file": sha256(path.read_bytes()).hexdigest(),
+        "config": shipped.result.config,
+        "updates": shipped.updates,
+        "task_version": 0,
+        "success_rate": 0.9,
+    }
+    file.write_text(json.dumps(card))
+    policy = ba_torchrl.load_policy(path)
+    command = f"`ba-torchrl export {path} path=NEW.safetensors`"
+    assert [command in message for message in caplog.messages] == [True]
+    assert (policy.updates, policy.result) == (shipped.updates, None)
+    for value, expected in zip(policy.parameters(), shipped.parameters(), strict=True):
+        assert torch.equal(value, expected)
+    policies.save_policy(policy, tmp_path / "new.safetensors", with_outcomes(1))
+    new = ba_torchrl.load_policy(tmp_path / "new.safetensors").result
+    assert (new.env_steps, new.trained_on) == (None, None)
+    file.write_text(json.dumps({**card, "policy_file": "of other weights"}))
+    with pytest.raises(ConfigError, match="does not have the weights"):
+        ba_torchrl.load_policy(path)
+    file.write_text(json.dumps({**card, "format": 4}))
+    with pytest.raises(ConfigError, match="`ba-torchrl export RUN`"):
         ba_torchrl.load_policy(path)
 
 
-def test_the_cards_of_shipped_policies_name_the_command_that_finds_them():
-    shipped = policies.shipped_policies()
-    commands = {task: ba_torchrl.load_policy(task).card.evaluate for task in shipped}
-    start = "ba-torchrl evaluate policy="
-    assert [task for task in shipped if not commands[task].startswith(f"{start}{task} ")] == []
+def test_the_result_of_a_policy_is_read_without_its_weights(tmp_path):
+    """Of a file of 64 GB, without any of its blocks."""
+    source = policies.shipped_file("close_loop/block_picking")
+    length, text = 2**36, json.dumps(header_texts(source))
+    entry = {"dtype": "U8", "shape": [length], "data_offsets": [0, length]}
+    header = f'{{"__metadata__": {text}, "weights": {json.dumps(entry)}}}'.encode()
+    path = tmp_path / "large.safetensors"
+    with path.open("wb") as file:
+        file.write(len(header).to_bytes(8, "little") + header)
+        file.truncate(8 + len(header) + length)
+    assert read_result(path) == read_result(source)
+    path.write_bytes((2**40).to_bytes(8, "little") + header)
+    with pytest.raises(ConfigError, match="header too large"):
+        read_result(path)
 
 
 QUICK = (
@@ -314,16 +369,15 @@ QUICK = (
     ],
 )
 def test_a_shipped_policy_reaches_the_goal(task):
-    """Twenty episodes; the card's interval is of hundreds, so its lower end bounds the mean."""
+    """Twenty episodes; the result's interval is of hundreds: its lower end bounds the mean."""
     policy = ba_torchrl.load_policy(task)
     assert policy.task == task
-    assert policy.card.episodes >= 100
     env = ba_torchrl.make_vector_env(task, 5, parallel=False, **policy.env_config)
     try:
         found = protocol.run_test(env, policy, policy.updates, 20)
     finally:
         env.close()
-    assert found.success_rate >= policy.card.interval[0] - 0.2
+    assert found.success_rate >= mean_success([[policy.result.last]]).low - 0.2
 
 
 def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsys, monkeypatch):
@@ -335,7 +389,7 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     recipe("evaluate", file, *options)
     out = capsys.readouterr().out
     success = float(out.split("success_rate ")[1].split()[0])
-    assert f"  card      {success:.2f} (" in out  # the same episodes
+    assert f"  in file   {success:.2f} (" in out  # the same episodes
     monkeypatch.setenv("HOME", str(tmp_path))
     recipe("export", str(run), "path=~/my files/p=1.safetensors", *options)
     out = capsys.readouterr().out
@@ -347,36 +401,27 @@ def test_a_run_is_exported_evaluated_and_played_by_commands(run, tmp_path, capsy
     assert (tmp_path / "film.gif").read_bytes().startswith(b"GIF")
 
 
-def test_the_test_of_a_shipped_policy_gives_its_record_and_its_card(tmp_path, monkeypatch):
-    task = "close_loop/block_picking"
+def test_the_test_of_a_shipped_policy_is_written_into_its_file(tmp_path, monkeypatch):
+    task, path = "close_loop/block_picking", tmp_path / "p.safetensors"
     monkeypatch.setattr(
-        shipped_records, "play", lambda _, settings: with_outcomes(*[0, 1] * settings.episodes)
+        shipped_results, "play", lambda _, settings: with_outcomes(*[0, 1] * settings.episodes)
     )
-    for name in (policies.TENSORS, policies.CARD):
-        shutil.copy(policies.shipped_file(task).with_suffix(name), tmp_path / f"p{name}")
-    monkeypatch.setattr(shipped_records, "shipped_file", lambda _: tmp_path / "p.safetensors")
-    monkeypatch.setattr(shipped_records, "RECORDS", tmp_path / "results")
-    assert not shipped_records.is_recorded(task)
-    assert shipped_records.take(task, 100) == f"{task}: 0.500 over 200 episodes"
-    record = RunResult.model_validate_json(shipped_records.record_file(task).read_bytes())
-    assert (record.last.successes, record.best) == ([0, 1] * 100, record.last)
-    card = policies.read_card(tmp_path / "p.safetensors")
-    assert (card.success_rate, card.episodes, card.protocol) == (0.5, 200, 1)
-    assert card.evaluate == f"ba-torchrl evaluate policy={task} episodes=200"
-    assert shipped_records.is_recorded(task)
-    (tmp_path / "p.safetensors").write_bytes(b"other")
-    assert not shipped_records.is_recorded(task)
+    shutil.copy(policies.shipped_file(task), path)
+    monkeypatch.setattr(shipped_results, "shipped_file", lambda _: path)
+    before = read_result(path)
+    assert shipped_results.is_tested(task)
+    assert shipped_results.take(task, 50) == f"{task}: 0.500 over 100 episodes"
+    after = read_result(path)
+    assert (after.last.successes, after.best) == ([0, 1] * 50, after.last)
+    assert (after.policy_file, after.trained_on) == (before.policy_file, before.trained_on)
+    assert not shipped_results.is_tested(task)  # too few episodes
+    shutil.copy(policies.shipped_file(task), path)
+    monkeypatch.setattr(TASKS[task], "version", 1)
+    assert not shipped_results.is_tested(task)
 
 
-def test_a_shipped_policy_has_one_number_in_card_and_record():
-    files = {task: shipped_records.record_file(task) for task in policies.shipped_policies()}
-    for task, file in files.items():
-        if not file.exists():
-            continue
-        record = RunResult.model_validate_json(file.read_bytes())
-        path = policies.shipped_file(task)
-        card = policies.read_card(path)
-        assert record.policy_file == sha256(path.read_bytes()).hexdigest(), task
-        assert policies.tested_card(card, record) == card, task
-        assert record.last.seeds == list(map(protocol.test_seed, range(record.last.episodes)))
-        assert record.last.is_citable
+def test_a_shipped_policy_has_the_weights_and_the_number_of_its_result():
+    for task in policies.shipped_policies():
+        result = ba_torchrl.load_policy(task).result
+        assert (result.task, result.trained_on is not None) == (task, True)
+        assert result.last.is_citable

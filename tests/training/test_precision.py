@@ -99,4 +99,4 @@ def test_a_run_shorter_than_the_interval_logs_its_last_update(
     for name in ("train/loss_qvalue", "train/env_steps"):
         assert scalars[name].steps.tolist() == steps
     assert scalars["eval/success_rate"].steps[-1] == result.updates
-    assert result.curve.exists()
+    assert (config.folder / result.files["curve"]).exists()

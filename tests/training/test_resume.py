@@ -127,7 +127,7 @@ def test_a_run_interrupted_before_its_first_state_starts_again(tmp_path, caplog,
     assert "has no saved state yet" in caplog.text
     assert {path.name for path in (tmp_path / "run").glob(".*")} == {".12.notes"}
     assert result.updates == 9
-    assert read_result(result.record.parent).resumed_at == []
+    assert result.resumed_at == []
 
 
 def test_a_changed_configuration_is_refused_by_name(interrupted, tmp_path, monkeypatch):

@@ -40,10 +40,10 @@ def test_a_run_ends_after_two_successful_evaluations_in_a_row(tmp_path, seeds, c
         result = Experiment(config, progress=False).run()
     assert result.updates == 8
     assert "the run ends at update 8" in caplog.text
-    record = read_result(config.folder)
-    assert [point.updates for point in record.curve] == [0, 2, 4, 6, 8]
-    assert record.last.updates == 8
-    assert record.curve[0].success_rate == UNTRAINED
+    result = read_result(config.folder)
+    assert [point.updates for point in result.curve] == [0, 2, 4, 6, 8]
+    assert result.last.updates == 8
+    assert result.curve[0].success_rate == UNTRAINED
     assert seeds[0] == seeds[1]
     assert len(set(seeds[1:])) == len(seeds[1:]) == 4
 
@@ -62,7 +62,7 @@ def test_a_run_ends_while_it_learns_from_demonstrations_alone(tmp_path, seeds):
 def test_a_run_that_has_ended_takes_no_update_when_it_is_resumed(tmp_path, seeds, monkeypatch):
     first = Experiment(config_for(tmp_path), progress=False)
     with monkeypatch.context() as patch:
-        patch.setattr(experiments, "write_record", raise_interrupted)
+        patch.setattr(experiments, "write_run_result", raise_interrupted)
         with pytest.raises(Interrupted):
             first.run()
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)

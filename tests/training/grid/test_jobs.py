@@ -291,7 +291,7 @@ def test_a_damaged_file_concerns_its_run_only(tmp_path, fake, name, detail):
         assert [status(run).state for run in runs] == ["failed", "done"]
         assert detail in status(runs[0]).detail
     page = write([tmp_path], tmp_path / "report")
-    text = {"result.json": "result.json is not the result of a run", "failure.json": detail}
+    text = {"result.json": "result.json has no valid result", "failure.json": detail}
     assert text.get(name, "") in (page.parent / "table.md").read_text()
 
 
