@@ -24,7 +24,7 @@ WORK = {
     "train": "ba_torchrl.training.experiment.Experiment",
     "benchmark": "plan",
     "report": None,  # there is no finished run
-    "leaderboard": "read_records",
+    "leaderboard": "read_results",
     "plot": "read_config",
     "gallery": "expert_strip",
     "tasks": "page",
