@@ -22,6 +22,9 @@ class LinearPolicy(nn.Module):
         self.net = nn.Linear(3, 2)
         self.log_std = nn.Parameter(torch.tensor([-0.5, -1.0]))
 
+    def reset_parameters(self):
+        nn.init.uniform_(self.log_std, -1, 0)
+
     def forward(self, depth, holding):
         x = torch.cat([depth, holding.to(depth.dtype)], dim=-1)
         loc = self.net(x)

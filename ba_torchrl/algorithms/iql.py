@@ -32,7 +32,7 @@ from ba_torchrl.data.transitions import Imitation
 from ba_torchrl.modules.actor_critic.critics import ActionValue, StateValue
 from ba_torchrl.modules.actor_critic.gaussian_policy import truncated_gaussian_policy
 from ba_torchrl.modules.base import NetworkConfig
-from ba_torchrl.objectives.iql import ModalIQLLoss
+from ba_torchrl.objectives.iql import EvalModeTargetsIQLLoss
 
 
 @ALGORITHMS.register("iql")
@@ -89,7 +89,7 @@ class IQL(Learner):
     """A truncated Gaussian policy, two critics and a state value."""
 
     config: IQLConfig
-    loss: ModalIQLLoss
+    loss: EvalModeTargetsIQLLoss
 
     def make_networks(self, network: NetworkConfig) -> IQLNetworks:
         """Return actor, critics and state value."""
@@ -109,11 +109,11 @@ class IQL(Learner):
             networks.actor, self.observation_keys, std_min=self.config.std_min
         )
 
-    def make_loss(self, networks: IQLNetworks) -> ModalIQLLoss:
+    def make_loss(self, networks: IQLNetworks) -> EvalModeTargetsIQLLoss:
         """Return TorchRL's loss without ``vmap``, under which the CPU's compiled convolutions and
         pools are not available."""
         inputs = [*self.observation_keys, keys.ACTION]
-        loss = ModalIQLLoss(
+        loss = EvalModeTargetsIQLLoss(
             self.make_policy(networks),
             [TensorDictModule(q, inputs, ["state_action_value"]) for q in networks.qvalues],
             TensorDictModule(networks.value, self.observation_keys, ["state_value"]),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import torch
 from pydantic import Field, model_validator
@@ -61,8 +61,9 @@ class SACConfig(LearnerConfig):
     """The same for the encoder; None for `tau`."""
     alpha_init: float = Field(default=0.01, gt=0)
     """Initial entropy temperature."""
-    target_entropy: float = -5.0
-    """Entropy that the temperature is tuned for, nats."""
+    target_entropy: float | Literal["auto"] = -5.0
+    """Entropy that the temperature is tuned for, nats; "auto" for minus the number of the action's
+    components."""
     entropy_backup: bool = True
     """Whether targets have the entropy term, as in the reference implementation."""
     bootstrap_truncated: bool = True
@@ -144,6 +145,12 @@ class SAC(Learner):
         actions = Bounded(-1.0, 1.0, (len(self.problem.actions.sequence),))
         return AdditiveGaussianModule(actions, sigma_init=sigma, sigma_end=sigma)
 
+    @property
+    def _target_entropy(self) -> float:
+        """The configured entropy, nats."""
+        entropy = self.config.target_entropy
+        return -float(self.problem.actions.size) if entropy == "auto" else entropy
+
     def make_loss(
         self, networks: ActorCritic, kind: type[SACfDLoss] = SACfDLoss, **options: Any
     ) -> SACfDLoss:
@@ -160,7 +167,7 @@ class SAC(Learner):
                 out_keys=["state_action_value"],
             ),
             alpha_init=config.alpha_init,
-            target_entropy=config.target_entropy,
+            target_entropy=self._target_entropy,
             entropy_backup=config.entropy_backup,
             **config.imitation.loss_options,
             **config.replay.loss_options,

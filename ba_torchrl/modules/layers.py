@@ -134,10 +134,18 @@ class CastConv2d(nn.Conv2d):
         return F.conv2d(x, self.weight.to(x.dtype), bias, self.stride, self.padding)
 
 
-def initialise_plain(module: nn.Module) -> None:
-    """Xavier-initialise a convolution or linear layer; a function for ``nn.Module.apply``."""
+class XavierInitialised(nn.Module):
+    """A network with Xavier-initialised convolutions and linear layers."""
+
+    def reset_parameters(self) -> None:
+        """Draw their weights anew; steerable layers, and linear layers of a subclass, draw theirs
+        by ``reset_parameters`` of their own."""
+        self.apply(_xavier)
+
+
+def _xavier(module: nn.Module) -> None:
     if isinstance(module, nn.Conv2d):
         nn.init.xavier_normal_(module.weight)
-    elif isinstance(module, nn.Linear):
+    elif type(module) is nn.Linear:
         nn.init.xavier_uniform_(module.weight)
         nn.init.zeros_(module.bias)

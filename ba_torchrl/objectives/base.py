@@ -17,10 +17,12 @@ from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
-from ba_torchrl.objectives.networks import ModalLoss
+from ba_torchrl.objectives.networks import (
+    EvalModeTargetsLoss,
+    Reduction,
+    checked_reduction,
+)
 
-Reduction = Literal["none", "mean", "sum"]
-"""How the losses of a batch's samples are combined, as in TorchRL."""
 WeightedTerms = Literal["none", "critic", "critic_and_policy", "all"]
 """Terms of a loss that importance weights multiply: the error of the values; also the policy's
 objective; also the terms on demonstrations and the entropy temperature."""
@@ -28,7 +30,7 @@ WeightNorm = Literal["max", "mean"]
 """Normalisation of a batch's importance weights, see `TransitionLoss`."""
 
 
-class TransitionLoss(ModalLoss):
+class TransitionLoss(EvalModeTargetsLoss):
     """A loss with one-step targets, reduced over a batch by TorchRL's rules.
 
     Samples that a mask excludes (TorchRL's ``loss_mask_key``) do not count.
@@ -75,8 +77,7 @@ class TransitionLoss(ModalLoss):
         self.weighted_terms: WeightedTerms = weighted_terms
         self.weight_norm: WeightNorm = weight_norm
         self.use_prioritized_weights = use_prioritized_weights
-        self.reduction: Reduction = "mean" if reduction is None else reduction
-        check_choice("reduction", self.reduction, Reduction)
+        self.reduction = checked_reduction(reduction)
         self._needed_keys: list[NestedKey] | None = None
 
     @property
@@ -132,11 +133,6 @@ class TransitionLoss(ModalLoss):
         ends = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
         names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
         return list(dict.fromkeys(names))
-
-    def _set_batch_size(self, tensordict: TensorDictBase, dims: int) -> None:
-        """Give tensors that were passed by name, and have no batch size yet, one of ``dims``."""
-        if not tensordict.batch_size:
-            tensordict.auto_batch_size_(dims)
 
     def _importance_weights(self, tensordict: TensorDictBase) -> dict[str, Tensor | None]:
         """Return the weights [...] of a term's samples, by the narrowest of `WeightedTerms` that

@@ -25,6 +25,8 @@ class LevelValues(Protocol):
 
     in_keys: list[NestedKey]
     """Keys of the observation, in the order of the arguments."""
+    action_dims: int
+    """Number of dimensions of an action: 1 for a vector, 0 for an index."""
 
     def __call__(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return the values [B, N] of each level and the index of the action's choice [B].
@@ -34,7 +36,11 @@ class LevelValues(Protocol):
         ...
 
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the greedy choices, level after level, and the last one's value [B, 1]."""
+        """Return the greedy choices [B, n], level after level, and the last one's value [B, 1]."""
+        ...
+
+    def value_of(self, *observation_and_choices: Tensor) -> Tensor:
+        """Return the last level's value [B, 1] of choices [B, n]; only double Q-learning asks."""
         ...
 
 
@@ -57,6 +63,7 @@ class SingleLevelValues(nn.Module):
             )
         self.values = values
         self.is_one_hot = choice.action_space == "one_hot"
+        self.action_dims = int(self.is_one_hot)
         self.in_keys: list[NestedKey] = list(values.in_keys)
         self._value_key = choice.in_keys[0]
 
@@ -64,6 +71,11 @@ class SingleLevelValues(nn.Module):
         """Return the choices [B, 1] of greatest value, and their values [B, 1]."""
         value, best = self._action_values(observation).max(dim=1, keepdim=True)
         return best, value
+
+    def value_of(self, *observation_and_choices: Tensor) -> Tensor:
+        """Return the values [B, 1] of choices [B, 1]."""
+        *observation, chosen = observation_and_choices
+        return self._action_values(observation).gather(1, chosen)
 
     def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return the values of all actions [B, N], and the index of the given action [B]."""
@@ -76,6 +88,11 @@ class SingleLevelValues(nn.Module):
         for key, value in zip(self.in_keys, observation, strict=True):
             data.set(key, value)
         return self.values(data)[self._value_key]
+
+
+def as_levels(network: LevelValues | QValueActor) -> LevelValues:
+    """Return a network of levels, which a `QValueActor` becomes as `SingleLevelValues`."""
+    return SingleLevelValues(network) if isinstance(network, QValueActor) else network
 
 
 def large_margin(q: Tensor, chosen: Tensor, margin: float) -> Tensor:
@@ -132,8 +149,10 @@ class LevelDQNLoss(TransitionLoss):
         loss_qvalue        = sum over levels of the mean of w_i huber(Q_level(s_i, a_i) - y_i)
         loss_demonstration = weight * sum over levels of the chosen term on the experts' samples
 
-    The target bootstraps on truncated steps and not on terminated ones. ``forward`` also writes the
-    priority, the mean of ``|Q_level - y|`` over the levels, of shape [B, 1], into its input.
+    With ``double_dqn``, these choices are greedy under the online network (van Hasselt et al.,
+    2016). The target bootstraps on truncated steps and not on terminated ones. ``forward`` also
+    writes the priority, the mean of ``|Q_level - y|`` over the levels, of shape [..., 1], into its
+    input.
 
     Args:
         value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
@@ -145,6 +164,8 @@ class LevelDQNLoss(TransitionLoss):
         margin: margin of "dqfd" and "sdqfd".
         first_beta: inverse temperature of "adet" at the first level.
         later_beta: inverse temperature of "adet" at later levels.
+        double_dqn: whether the online network chooses the actions whose values the target network
+            computes.
         options: of `TransitionLoss`; the formulas above are for the reduction "mean".
     """
 
@@ -170,17 +191,18 @@ class LevelDQNLoss(TransitionLoss):
         margin: float = 0.1,
         first_beta: float = 100.0,
         later_beta: float = 1.0,
+        double_dqn: bool = False,
         **options: Any,
     ) -> None:
         check_choice("demonstrations", demonstrations, Demonstrations)
         super().__init__(**options)
-        if isinstance(value_network, QValueActor):
-            value_network = SingleLevelValues(value_network)
+        value_network = as_levels(value_network)
         self.demonstrations = demonstrations
         self.demonstration_weight = demonstration_weight
         self.margin = margin
         self.first_beta = first_beta
         self.later_beta = later_beta
+        self.double_dqn = double_dqn
         self.convert_to_functional(value_network, "value_network", create_target_params=True)
         # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=next(self.parameters()).device)
@@ -196,11 +218,11 @@ class LevelDQNLoss(TransitionLoss):
         """Return the losses and detached diagnostics of a batch of transitions.
 
         Args:
-            tensordict: transitions [B]; gets the priority written into it.
+            tensordict: transitions [...]; gets the priority written into it.
 
         Returns:
             ``loss_qvalue`` and ``loss_demonstration``, scalars or, with the reduction "none", of
-            shape [B], whose sum is minimised; and without gradient the scalars
+            shape [...], whose sum is minimised; and without gradient the scalars
             ``demonstration_error`` (the term before its weight), ``td_error``, ``q_value`` and
             ``target_value`` (means over the batch; levels averaged).
 
@@ -208,7 +230,10 @@ class LevelDQNLoss(TransitionLoss):
             KeyError: an entry is missing, such as the demonstration flag if there is a term on
                 demonstrations.
         """
-        self._set_batch_size(tensordict, 1)
+        reward = tensordict[keys.NEXT, self.tensor_keys.reward]
+        self._set_batch_size(tensordict, reward.ndim - 1)
+        if tensordict.ndim != 1:
+            return self._of_one_dimension(tensordict, self.tensor_keys.priority)
         target = self._target(tensordict)
         network = self.network("value_network")
         with self.value_network_params.to_module(network, preserve_module_state=False):
@@ -246,10 +271,16 @@ class LevelDQNLoss(TransitionLoss):
     @torch.no_grad()
     def _target(self, tensordict: TensorDictBase) -> Tensor:
         """Return y [B, 1]."""
-        following = tensordict[keys.NEXT]
-        params, network = self.target_value_network_params, self.network("value_network")
-        with params.to_module(network, preserve_module_state=False):
-            _, value = network.greedy(*(following[key] for key in network.in_keys))
+        network = self.network("value_network")
+        observation = [tensordict[keys.NEXT][key] for key in network.in_keys]
+        online, target = self.value_network_params, self.target_value_network_params
+        with (online if self.double_dqn else target).to_module(
+            network, preserve_module_state=False
+        ):
+            chosen, value = network.greedy(*observation)
+        if self.double_dqn:
+            with target.to_module(network, preserve_module_state=False):
+                value = network.value_of(*observation, chosen)
         return self.value_estimator.value_estimate(tensordict, next_value=value)
 
     def _demonstration_losses(

@@ -10,19 +10,24 @@ import torch.nn.functional as F
 from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, dispatch
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
+from torchrl.modules import QValueActor
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.distance import ActionDistance, action_distance
-from ba_torchrl.objectives.dqn import LevelValues
-from ba_torchrl.objectives.networks import ModalLoss
+from ba_torchrl.objectives.dqn import LevelValues, as_levels
+from ba_torchrl.objectives.networks import (
+    EvalModeTargetsLoss,
+    Reduction,
+    checked_reduction,
+)
 
 
-class _ImitationLoss(ModalLoss):
-    """A loss on observations and the actions to imitate, a mean over the samples of a batch that no
-    mask excludes (TorchRL's ``loss_mask_key``)."""
+class _ImitationLoss(EvalModeTargetsLoss):
+    """A loss on observations and the actions to imitate, reduced over the samples of a batch that
+    no mask excludes (TorchRL's ``loss_mask_key``)."""
 
     @dataclass
     class _AcceptedKeys:
@@ -32,6 +37,10 @@ class _ImitationLoss(ModalLoss):
 
     tensor_keys: _AcceptedKeys
     default_keys = _AcceptedKeys
+
+    def __init__(self, reduction: Reduction | None) -> None:
+        super().__init__()
+        self.reduction = checked_reduction(reduction)
 
     def _set_observation(self, observation: Sequence[NestedKey]) -> None:
         self._observation = list(observation)
@@ -57,6 +66,7 @@ class BehaviourCloningLoss(_ImitationLoss):
         actor_network: policy; from the observation to a distribution with ``rsample``.
         distance: of actions.
         entropy_weight: weight w of the negative entropy of the policy.
+        reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
     """
 
     actor_network: ProbabilisticTensorDictSequential
@@ -68,9 +78,10 @@ class BehaviourCloningLoss(_ImitationLoss):
         actor_network: ProbabilisticTensorDictSequential,
         distance: ActionDistance = "mse",
         entropy_weight: float = 0.0,
+        reduction: Reduction | None = None,
     ) -> None:
         check_choice("distance", distance, ActionDistance)
-        super().__init__()
+        super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
         self.distance: ActionDistance = distance
         self.entropy_weight = entropy_weight
@@ -79,12 +90,13 @@ class BehaviourCloningLoss(_ImitationLoss):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_bc`` and, with the entropy term, ``entropy`` without gradient.
+        """Return ``loss_bc`` and, with the entropy term, its mean ``entropy`` without gradient.
 
         Args:
-            tensordict: observations and expert actions [B]. The observation's entries may have a
+            tensordict: observations and expert actions [...]. The observation's entries may have a
                 dimension of views after the batch.
         """
+        self._set_batch_size(tensordict, tensordict[self.tensor_keys.action].ndim - 1)
         actor = self.network("actor_network")
         with self.actor_network_params.to_module(actor, preserve_module_state=False):
             distribution = actor.get_dist(tensordict.select(*actor.in_keys))
@@ -95,14 +107,18 @@ class BehaviourCloningLoss(_ImitationLoss):
         action = tensordict[self.tensor_keys.action]
         if sample.ndim > action.ndim:
             action = action.unsqueeze(-2).expand_as(sample)
-        distance = action_distance(sample, action, self.distance)
-        loss = self._reduce_loss(distance, tensordict, reduction="mean")
+        loss = self._over_samples(action_distance(sample, action, self.distance), tensordict)
         if not self.entropy_weight:
             return TensorDict({"loss_bc": loss})
-        log_prob = self._reduce_loss(log_prob, tensordict, reduction="mean")
-        return TensorDict(
-            {"loss_bc": loss + self.entropy_weight * log_prob, "entropy": -log_prob.detach()}
-        )
+        loss = loss + self.entropy_weight * self._over_samples(log_prob, tensordict)
+        entropy = -self._reduce_loss(log_prob.detach(), tensordict, reduction="mean")
+        return TensorDict({"loss_bc": loss, "entropy": entropy})
+
+    def _over_samples(self, losses: Tensor, tensordict: TensorDictBase) -> Tensor:
+        """Return the reduction of losses [...], or of means over views of losses [..., views]."""
+        if losses.ndim > tensordict.ndim and self.reduction != "mean":  # the same in any order
+            losses = losses.mean(dim=-1)
+        return self._reduce_loss(losses, tensordict)
 
 
 class LevelCrossEntropyLoss(_ImitationLoss):
@@ -112,7 +128,9 @@ class LevelCrossEntropyLoss(_ImitationLoss):
     the expert's choices at the levels before, averaged over the batch and summed over the levels.
 
     Args:
-        value_network: computes the values of the levels.
+        value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
+            single level, see `SingleLevelValues`.
+        reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
     """
 
     value_network: nn.Module
@@ -121,22 +139,27 @@ class LevelCrossEntropyLoss(_ImitationLoss):
 
     out_keys = ("loss_bc", "accuracy")
 
-    def __init__(self, value_network: LevelValues) -> None:
-        super().__init__()
+    def __init__(
+        self, value_network: LevelValues | QValueActor, reduction: Reduction | None = None
+    ) -> None:
+        super().__init__(reduction)
+        value_network = as_levels(value_network)
         self.convert_to_functional(value_network, "value_network")
         self._set_observation(value_network.in_keys)
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return ``loss_bc`` of observations and expert actions [B], and the fraction of choices
+        """Return ``loss_bc`` of observations and expert actions [...], and the fraction of choices
         that are the expert's as ``accuracy``."""
+        action = tensordict[self.tensor_keys.action]
+        self._set_batch_size(tensordict, action.ndim - self.value_network.action_dims)
+        if tensordict.ndim != 1:
+            return self._of_one_dimension(tensordict)
         network = self.network("value_network")
         with self.value_network_params.to_module(network, preserve_module_state=False):
             levels = network(*(tensordict[key] for key in self.in_keys))
         losses = [F.cross_entropy(*level, reduction="none") for level in levels]
         hits = [(values.argmax(dim=1) == chosen).float() for values, chosen in levels]
-        losses, hits = (
-            torch.stack([self._reduce_loss(each, tensordict, reduction="mean") for each in terms])
-            for terms in (losses, hits)
-        )
-        return TensorDict({"loss_bc": losses.sum(), "accuracy": hits.mean()})
+        losses = torch.stack([self._reduce_loss(each, tensordict) for each in losses])
+        hits = [self._reduce_loss(each, tensordict, reduction="mean") for each in hits]
+        return TensorDict({"loss_bc": losses.sum(dim=0), "accuracy": torch.stack(hits).mean()})

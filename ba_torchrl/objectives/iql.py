@@ -9,10 +9,10 @@ from tensordict import TensorDictBase, TensorDictParams
 from tensordict.nn import TensorDictModule
 from torchrl.objectives import IQLLoss
 
-from ba_torchrl.objectives.networks import ModalLoss
+from ba_torchrl.objectives.networks import EvalModeTargetsLoss
 
 
-class ModalIQLLoss(IQLLoss, ModalLoss):
+class EvalModeTargetsIQLLoss(IQLLoss, EvalModeTargetsLoss):
     """TorchRL's ``IQLLoss``, whose networks are in training mode only in the terms that train them.
 
     Arguments and values are those of `torchrl.objectives.IQLLoss`.

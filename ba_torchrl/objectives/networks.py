@@ -1,25 +1,33 @@
-"""The networks of losses: in which mode they compute, and how the buffers of targets move."""
+"""The networks of losses: their mode, new initial parameters, and how buffers of targets move."""
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+import warnings
+from typing import Any, Literal, TypeVar
 
 import torch
+from tensordict import TensorDictBase, TensorDictParams
+from tensordict.utils import NestedKey
 from torch import nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
+from ba_torchrl.core.errors import check_choice
 from ba_torchrl.core.evaluation_mode import evaluation_copy
 
 Updater = TypeVar("Updater", bound=TargetNetUpdater)
+Reduction = Literal["none", "mean", "sum"]
+"""How the losses of a batch's samples are combined, as in TorchRL."""
 
 
-class ModalLoss(LossModule):
+class EvalModeTargetsLoss(LossModule):
     """A loss whose networks compute in evaluation mode where there is no gradient.
 
     They do so for targets, and for the whole loss under `torch.no_grad`. Elsewhere they are in the
     mode in which they were given, usually training mode.
     """
+
+    reduction: Reduction
 
     def convert_to_functional(
         self, module: nn.Module, module_name: str, *args: Any, **kwargs: Any
@@ -33,6 +41,78 @@ class ModalLoss(LossModule):
     def network(self, name: str) -> Any:
         """Return a network, in evaluation mode if gradients are disabled."""
         return self.__dict__[name if torch.is_grad_enabled() else f"{name}_in_evaluation_mode"]
+
+    @torch.no_grad()
+    def reset_parameters_recursive(self) -> None:
+        """Draw the parameters of all networks anew; targets get the same values.
+
+        Layers draw theirs by ``reset_parameters``, as torch's do. Coefficients of the loss, such as
+        an entropy temperature, keep their values.
+
+        Warns:
+            UserWarning: parameters have no such layer and keep their values.
+        """
+        kept: set[str] = set()
+        for name, part in self.named_children():
+            if not isinstance(part, TensorDictParams):
+                kept |= _not_reset(part)
+                _reset_parameters(part)
+            elif not name.startswith("target_"):
+                network = self.__dict__[name.removesuffix("_params")]
+                kept |= _not_reset(network)
+                for params in part.data.unbind(0) if part.ndim else (part.data,):
+                    with params.to_module(network, preserve_module_state=False):
+                        _reset_parameters(network)
+        for name, part in self.named_children():
+            if name.startswith("target_"):
+                part.data.update_(getattr(self, name.removeprefix("target_")).data)
+        if kept:
+            names = ", ".join(sorted(kept))
+            warnings.warn(f"{names}: parameters kept, without reset_parameters", stacklevel=2)
+
+    def _set_batch_size(self, tensordict: TensorDictBase, dims: int) -> None:
+        """Give tensors that were passed by name, and have no batch size yet, one of ``dims``."""
+        if not tensordict.batch_size:
+            tensordict.auto_batch_size_(dims)
+
+    def _of_one_dimension(self, tensordict: TensorDictBase, *written: NestedKey) -> TensorDictBase:
+        """Return the loss of a batch of any shape, by `forward` of its samples in one dimension.
+
+        Args:
+            written: keys of entries that `forward` writes into its input.
+        """
+        samples, shape = tensordict.reshape(-1), tensordict.batch_size
+        out = self.forward(samples)
+        for key in written:
+            tensordict.set(key, samples[key].reshape(*shape, *samples[key].shape[1:]))
+        if self.reduction == "none":
+            for key, losses in out.items():
+                if losses.ndim:
+                    out.set(key, losses.reshape(shape))
+        return out
+
+
+def checked_reduction(reduction: Reduction | None) -> Reduction:
+    """Return how losses are combined: as given, or "mean" for None."""
+    reduction = "mean" if reduction is None else reduction
+    check_choice("reduction", reduction, Reduction)
+    return reduction
+
+
+def _reset_parameters(module: nn.Module) -> None:
+    """Reset the parameters of a module's parts, then its own."""
+    for child in module.children():
+        _reset_parameters(child)
+    if hasattr(module, "reset_parameters"):
+        module.reset_parameters()
+
+
+def _not_reset(module: nn.Module) -> set[str]:
+    """Return the classes of modules with parameters that no ``reset_parameters`` draws."""
+    if hasattr(module, "reset_parameters"):
+        return set()
+    own = {type(module).__name__} if any(True for _ in module.parameters(recurse=False)) else set()
+    return own.union(*map(_not_reset, module.children()))
 
 
 def with_buffer_updates(updater: Updater) -> Updater:

@@ -64,11 +64,11 @@ class RLPDLoss(SACfDLoss):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and detached diagnostics of transitions [B]."""
+        """Return the losses and detached diagnostics of transitions [...]."""
         return super().forward(tensordict).select(*self.out_keys)
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDict:
-        """Return ``loss_qvalue`` of transitions [B] and its diagnostics only."""
+        """Return ``loss_qvalue`` of transitions [...] and its diagnostics only."""
         features = self._features(
             self._observation(tensordict, self.views), self.encoder_network_params
         )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import torch
 import torch.nn.functional as F
@@ -13,6 +13,7 @@ from tensordict import TensorDict, TensorDictBase, TensorDictParams
 from tensordict.nn import ProbabilisticTensorDictSequential, TensorDictModule, dispatch
 from tensordict.utils import NestedKey
 from torch import Tensor, nn
+from torchrl.data import Composite
 from torchrl.objectives import LossModule, SoftUpdate
 from torchrl.objectives.sac import compute_rsample_log_prob
 from typing_extensions import Self
@@ -60,7 +61,9 @@ class SACfDLoss(TransitionLoss):
         encoder_network: from the observation to a single entry, the critics' shared features.
         qvalue_network: from features and action to twin values [..., 2].
         alpha_init: initial entropy temperature.
-        target_entropy: entropy that the temperature is tuned for, nats.
+        target_entropy: entropy that the temperature is tuned for, nats. With "auto", as in TorchRL,
+            it is minus the number of the action's components, which is taken from the actor's spec
+            or, without one, from the first batch; it is nan until then.
         entropy_backup: whether y has the entropy term; without it, y is the return alone.
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no flag of
             demonstrations in the batch.
@@ -114,7 +117,7 @@ class SACfDLoss(TransitionLoss):
         qvalue_network: TensorDictModule,
         *,
         alpha_init: float = 0.01,
-        target_entropy: float = -5.0,
+        target_entropy: float | Literal["auto"] = "auto",
         entropy_backup: bool = True,
         demonstration_weight: float = 1.0,
         demonstration_distance: ActionDistance = "mse",
@@ -140,7 +143,10 @@ class SACfDLoss(TransitionLoss):
         """Keys of the parameters that the actor shares with the encoder, in both networks."""
         self._share_encoder()
         device = next(self.parameters()).device
+        if target_entropy == "auto":
+            target_entropy = _entropy_of_spec(actor_network)
         self.register_coeff_buffer("target_entropy", float(target_entropy), device=device)
+        self.target_entropy = float(target_entropy)  # for `__setattr__`
         self.register_coeff_buffer(
             "demonstration_weight", float(demonstration_weight), device=device
         )
@@ -153,7 +159,7 @@ class SACfDLoss(TransitionLoss):
         self.contrastive = None if contrastive is None else contrastive.to(device)
         # Made before the first forward pass, because its gamma is part of the state_dict.
         self.make_value_estimator(device=device)
-        self.register_load_state_dict_post_hook(_reread_demonstration_weight)
+        self.register_load_state_dict_post_hook(_reread_coefficients)
 
     def _share_encoder(self) -> None:
         """Make shared parameters constants in the actor's terms, in the memory of the encoder's, so
@@ -173,8 +179,11 @@ class SACfDLoss(TransitionLoss):
         self._share_encoder()
 
     def __setattr__(self, name: str, value: Any) -> None:
-        """Set an attribute; a behaviour weight other than 0 needs the flag of demonstrations."""
+        """Set an attribute; a behaviour weight other than 0 needs the flag of demonstrations, and
+        a target entropy of nan the size of an action."""
         super().__setattr__(name, value)
+        if name == "target_entropy":
+            self._needs_action_size = bool(value != value)
         if name == "demonstration_weight":
             self._needs_demonstration_flag = bool(value != 0)
             self._needed_keys = None
@@ -201,11 +210,11 @@ class SACfDLoss(TransitionLoss):
         """Return the losses and detached diagnostics of a batch of transitions.
 
         Args:
-            tensordict: transitions [..., B]; gets the priority written into it.
+            tensordict: transitions [...]; gets the priority written into it.
 
         Returns:
             ``loss_actor``, ``loss_qvalue`` and ``loss_alpha``, scalars or, with the reduction
-            "none", of shape [..., B]; and without gradient the scalars ``alpha``, ``entropy``,
+            "none", of shape [...]; and without gradient the scalars ``alpha``, ``entropy``,
             ``demonstration_error`` (the unweighted behaviour term) and ``q_value`` (mean of the
             twin values of the stored actions).
 
@@ -220,6 +229,8 @@ class SACfDLoss(TransitionLoss):
         loss_qvalue, values = self._critic_terms(tensordict, features, weights)
 
         sample, log_prob = self._sample_action(state)
+        if self._needs_action_size:
+            self.target_entropy = -float(sample.shape[-1])
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
         q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
@@ -284,7 +295,13 @@ class SACfDLoss(TransitionLoss):
         Args:
             tensordict: observations [B], of which only the first of several views is used, and
                 other views of them under "positive".
+
+        Raises:
+            ValueError: the batch has another number of dimensions than one.
         """
+        if tensordict.ndim != 1:
+            shape = list(tensordict.batch_size)
+            raise ValueError(f"contrastive_loss compares the samples of a batch [B], got {shape}")
         state = self._observation(tensordict, self.views)
         anchors = self._features(
             state[:, 0] if self.views > 1 else state, self.encoder_network_params
@@ -371,6 +388,14 @@ class SACfDLoss(TransitionLoss):
         return torch.zeros(tensordict.batch_size, dtype=torch.bool, device=action.device)
 
 
+def _entropy_of_spec(actor: ProbabilisticTensorDictSequential) -> float:
+    """Return minus the number of components in the spec of an actor's action; nan without one."""
+    spec = getattr(actor, "spec", None)
+    if isinstance(spec, Composite):
+        spec = spec.get(actor.dist_sample_keys[0], None)
+    return math.nan if spec is None else -float(spec.shape[-1])
+
+
 class BilinearInfoNCE(nn.Module):
     """InfoNCE with a learnt bilinear similarity (CURL: Srinivas et al., 2020, section 4;
     FERM, appendix G.2).
@@ -385,7 +410,12 @@ class BilinearInfoNCE(nn.Module):
 
     def __init__(self, features: int) -> None:
         super().__init__()
-        self.weight = nn.Parameter(torch.rand(features, features))
+        self.weight = nn.Parameter(torch.empty(features, features))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Draw the weights of the similarity from [0, 1)."""
+        nn.init.uniform_(self.weight)
 
     def forward(self, anchors: Tensor, positives: Tensor) -> Tensor:
         """Return the losses [B] of anchors [B, F] and their positives [B, F]."""
@@ -395,9 +425,10 @@ class BilinearInfoNCE(nn.Module):
         return F.cross_entropy(similarities, labels, reduction="none")
 
 
-def _reread_demonstration_weight(loss: SACfDLoss, _: object) -> None:
-    """Let a restored loss need the flag of demonstrations as its saved weight says."""
+def _reread_coefficients(loss: SACfDLoss, _: object) -> None:
+    """Let a restored loss need of a batch what its saved coefficients say."""
     loss.demonstration_weight = float(loss.demonstration_weight)
+    loss.target_entropy = float(loss.target_entropy)
 
 
 class SoftUpdateByNetwork(SoftUpdate):

@@ -1,13 +1,15 @@
-"""Every registered actor-critic: sizes, shapes, precision, errors."""
+"""Every registered actor-critic: sizes, shapes, precision, errors; parameters that are reset."""
 
 import pytest
 import torch
 from pydantic import ValidationError
+from tensordict.nn import TensorDictModule
+from torch import nn
 
 from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import compute_dtype
-from tests.modules.networks import ACTOR_CRITICS, count
+from tests.modules.networks import ACTOR_CRITICS, SPATIAL, count, spatial
 from tests.modules.networks import actor_critic as small
 from tests.specs import actor_critic_spec
 
@@ -159,3 +161,25 @@ def test_what_cannot_be_built_is_refused(name, fields, spec, message):
 def test_bad_action_sequences_are_refused(sequence):
     with pytest.raises(ValueError, match="action_sequence"):
         actor_critic_spec(64, sequence)
+
+
+@pytest.mark.parametrize("name", [*ACTOR_CRITICS, "ensemble", *SPATIAL, "asr/pose"])
+def test_parameters_that_are_reset_have_the_sizes_of_a_new_network(name):
+    def build():
+        if name in SPATIAL or "/" in name:
+            return nn.ModuleList([spatial(name)])
+        network, critics = ("equi", 3) if name == "ensemble" else (name, None)
+        return nn.ModuleList(small(network, critics=critics))
+
+    new, reset = build(), build()
+    with torch.no_grad():
+        for value in reset.parameters():
+            value.add_(1000)
+    torch.manual_seed(1)
+    TensorDictModule(reset, [], []).reset_parameters_recursive()
+    for (key, value), wanted in zip(reset.named_parameters(), new.parameters(), strict=True):
+        if wanted.numel() < 200 or not wanted.any():
+            assert value.abs().max() <= 4 * wanted.abs().max(), key
+        else:
+            assert float(value.std()) == pytest.approx(float(wanted.std()), rel=0.3), key
+            assert not torch.equal(value, wanted), key

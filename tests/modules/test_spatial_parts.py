@@ -15,8 +15,8 @@ from ba_torchrl.modules.spatial.in_hand import InHandMap, InHandVector
 from ba_torchrl.modules.spatial.views import centre_fit, patches
 from ba_torchrl.modules.steerable.layers import (
     DynamicSteerableConv2d,
+    FilterGenerator,
     SteerableConv2d,
-    filter_generator,
     planar_rotations,
     planar_yaws,
 )
@@ -96,7 +96,7 @@ def test_dynamic_filter_equals_a_loop_over_escnn_layers(group, kernel_size):
 def test_zero_features_give_a_he_initialised_filter():
     torch.manual_seed(0)
     gspace, layer, _ = dynamic(count=16)
-    generator = filter_generator(64, layer)
+    generator = FilterGenerator(64, layer)
     types = [(gspace.regular_repr, 16)]
     plain = SteerableConv2d(gspace, types, types, 3).coefficients["in0_out0"]
     coefficients = generator(torch.zeros(1, 64))[0]

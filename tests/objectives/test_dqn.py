@@ -6,75 +6,16 @@ import statistics
 
 import pytest
 import torch
-from tensordict import TensorDict
 from torch import nn
 from torchrl.modules import QValueActor
-from torchrl.objectives import DQNLoss
+from torchrl.objectives import DQNLoss, SoftUpdate
 
-from ba_torchrl.core.actions import OpenLoopActions
-from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
-from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
+from ba_torchrl.modules.spatial.policy import SpatialValues
 from ba_torchrl.objectives.dqn import LevelDQNLoss, large_margin, strict_large_margin
+from tests.level_tables import ACTIONS, COUNTS, Tables, batch
 
 GAMMA = 0.9
-BOUNDS = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
-COUNTS = (3, 3, 4, 5, 3, 2)
-"""Rows, columns, yaws, z, ry, rx."""
-LEVELS = (
-    Level(("x", "y"), COUNTS[:2]),
-    *(Level((name,), (n,)) for name, n in zip(("rz", "z", "ry", "rx"), COUNTS[2:], strict=True)),
-)
-ACTIONS = SpatialActions(OpenLoopActions("pxyzrrr", BOUNDS), LEVELS)
 KINDS = ["dqfd", "sdqfd", "adet"]
-
-
-class Tables(SpatialQNetwork):
-    """Values from tables over all choices so far, times the mean of the image."""
-
-    levels = LEVELS
-
-    def __init__(self):
-        super().__init__()
-        generator = torch.Generator().manual_seed(1)
-        self.tables = nn.ParameterList(
-            torch.randn(2, *COUNTS[: n + 2], generator=generator) for n in range(5)
-        )
-
-    def first(self, heightmap, in_hand, holding):
-        state = holding[:, 0].long(), heightmap.mean(dim=(1, 2, 3))
-        return self.tables[0][state[0]] * state[1][:, None, None], state
-
-    def later(self, level, state, chosen):
-        primitive, scale = state
-        return self.tables[level][(primitive, *chosen.unbind(1))] * scale[:, None]
-
-
-def batch(size=10, experts="some", seed=0):
-    """Random transitions, with the indices of their actions under "chosen"."""
-    generator = torch.Generator().manual_seed(seed)
-    flags = torch.rand(size, 1, generator=generator) < 0.5
-    flags = {"some": flags, "all": torch.ones_like(flags), "none": torch.zeros_like(flags)}[experts]
-    ends = torch.rand(2, size, 1, generator=generator) < 0.3
-    chosen = torch.stack([torch.randint(n, (size,), generator=generator) for n in COUNTS], dim=1)
-
-    def state():
-        return {
-            "heightmap": torch.rand(size, 1, 3, 3, generator=generator) + 0.5,
-            "in_hand": torch.zeros(size, 1, 4, 4),
-            "holding": torch.rand(size, 1, generator=generator) < 0.5,
-        }
-
-    following = {
-        "reward": torch.rand(size, 1, generator=generator),
-        "terminated": ends[0],
-        "truncated": ends[1] & ~ends[0],
-        "done": ends[0] | ends[1],
-    }
-    data = TensorDict(
-        {**state(), "is_demonstration": flags, "next": {**state(), **following}}, batch_size=[size]
-    )
-    data["action"] = ACTIONS.to_action(chosen, data["holding"])
-    return data.set("chosen", chosen)
 
 
 def make_loss(**settings):
@@ -116,13 +57,15 @@ def by_hand(loss, data, kind, td_weights=None, term_weights=None):
     td_weights, term_weights = td_weights or ones, term_weights or ones
     td, term, priorities = 0.0, 0.0, []
     for i, choices in enumerate(data["chosen"].tolist()):
-        greedy = ()
-        for level in range(5):  # the target's choices, each given those before
-            following = lookup(loss.target_value_network_params, level, data["next"], i, greedy)
+        greedy, target = (), loss.target_value_network_params
+        chooser = loss.value_network_params if loss.double_dqn else target
+        for level in range(5):  # the greedy choices, each given those before
+            following = lookup(chooser, level, data["next"], i, greedy)
             best = max(following, key=following.get)
+            last = lookup(target, level, data["next"], i, greedy)[best]
             greedy += best
         alive = not data["next", "terminated"][i]
-        y = float(data["next", "reward"][i]) + GAMMA * alive * following[best]
+        y = float(data["next", "reward"][i]) + GAMMA * alive * last
         errors = []
         for level in range(5):  # the stored choices, each given those before
             before = choices[: level + 1] if level else []
@@ -139,9 +82,10 @@ def by_hand(loss, data, kind, td_weights=None, term_weights=None):
 
 
 @pytest.mark.parametrize("experts", ["some", "all", "none"])
-@pytest.mark.parametrize("kind", ["none", *KINDS])
+@pytest.mark.parametrize("kind", ["none", *KINDS, "double"])
 def test_the_losses_equal_a_loop_written_from_the_formulas(kind, experts):
-    data, loss = batch(experts=experts), make_loss(demonstrations=kind)
+    kind, is_double = ("none", True) if kind == "double" else (kind, False)
+    data, loss = batch(experts=experts), make_loss(demonstrations=kind, double_dqn=is_double)
     td, demonstration, priorities = by_hand(loss, data, kind)
     out = loss(data)
     assert float(out["loss_qvalue"].detach()) == pytest.approx(td, rel=1e-5)
@@ -235,21 +179,6 @@ def test_keys_can_be_renamed():
     assert "surprise" in data
 
 
-@pytest.mark.parametrize("demonstrations", ["none", *KINDS])
-def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum(demonstrations):
-    data, found = batch(experts="all"), {}
-    for reduction in ("none", "mean", "sum"):
-        loss = make_loss(demonstrations=demonstrations, reduction=reduction)
-        found[reduction] = loss(data.clone())
-    for name in ("loss_qvalue", "loss_demonstration"):
-        losses = found["none"][name]
-        assert losses.shape == (10,)
-        torch.testing.assert_close(found["mean"][name], losses.mean())
-        torch.testing.assert_close(found["sum"][name], losses.sum())
-    for name in ("demonstration_error", "td_error"):
-        assert torch.equal(found["none"][name], found["mean"][name])
-
-
 @pytest.mark.parametrize("demonstrations", KINDS)
 def test_samples_that_are_not_demonstrations_have_no_demonstration_loss(demonstrations):
     data = batch()
@@ -282,17 +211,24 @@ def q_value_actor(action_space="categorical"):
 @pytest.mark.parametrize("uses_weights", ["auto", True, False])
 @pytest.mark.parametrize("is_masked", [False, True])
 @pytest.mark.parametrize("reduction", ["none", "mean", "sum"])
-def test_without_demonstrations_the_loss_is_torchrls(reduction, is_masked, uses_weights):
+@pytest.mark.parametrize("double_dqn", [False, True])
+def test_without_demonstrations_the_loss_is_torchrls(
+    double_dqn, reduction, is_masked, uses_weights
+):
     _, actor, data, _ = q_value_actor()
     data["next", "reward"] *= 3
     data["priority_weight"] = torch.linspace(0.1, 1, 10)
     if is_masked:
         data["collector", "mask"] = torch.arange(10)[:, None] % 3 > 0
     options = {"reduction": reduction, "use_prioritized_weights": uses_weights}
+    options["double_dqn"] = double_dqn
     ours = LevelDQNLoss(actor, demonstrations="none", **options)
     theirs = DQNLoss(actor, loss_function="smooth_l1", action_space="categorical", **options)
     for loss in (ours, theirs):
         loss.make_value_estimator(gamma=GAMMA)
+        SoftUpdate(loss, tau=0.1)
+        for value in loss.target_value_network_params.values(True, True):
+            value.mul_(-0.5)  # another action is the greedy one
     expected = theirs(data.clone())["loss"]
     torch.testing.assert_close(ours(data)["loss_qvalue"], expected)
 

@@ -93,6 +93,7 @@ class TwoLevels(nn.Module):
     """Values [B, 3] and [B, 2]; the action holds the choices."""
 
     in_keys = ("depth",)
+    action_dims = 1
 
     def __init__(self):
         super().__init__()

@@ -1,5 +1,6 @@
 """The losses of SACfD and RLPD against plain arithmetic, and against TorchRL's contract."""
 
+import copy
 import itertools
 import math
 import statistics
@@ -9,11 +10,13 @@ import torch
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torch.distributions import Bernoulli, kl_divergence
+from torchrl.data import Bounded
+from torchrl.modules import ProbabilisticActor
 from torchrl.objectives import SACLoss, SoftUpdate, ValueEstimators
 
 from ba_torchrl.core import keys
 from ba_torchrl.objectives.rlpd import RLPDLoss
-from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SoftUpdateByNetwork
+from ba_torchrl.objectives.sacfd import BilinearInfoNCE, SACfDLoss, SoftUpdateByNetwork
 from tests.linear_sac import batch, make
 
 
@@ -151,11 +154,32 @@ def test_defaults_are_those_of_the_appendix_and_the_entropy_can_be_left_out_of_t
     data, losses = batch(), []
     for backup in (True, False):
         loss = make(entropy_backup=backup)
-        expected, _ = by_hand(loss, data, 0.99, 0.01, -5, 1, entropy_backup=backup)
+        expected, _ = by_hand(loss, data, 0.99, 0.01, -2, 1, entropy_backup=backup)
         out = loss(data)
         assert_terms(out, expected)
         losses.append(out["loss_qvalue"].item())
     assert losses[0] != pytest.approx(losses[1], rel=1e-4)
+
+
+def test_the_automatic_target_entropy_is_minus_the_size_of_an_action():
+    loss, data = make(), batch()
+    assert loss.target_entropy.isnan()
+    undecided, chosen = copy.deepcopy(loss.state_dict()), make(target_entropy=-1.5)
+    for state, expected in ((undecided, -2.0), (chosen.state_dict(), -1.5)):
+        loss.load_state_dict(state)
+        loss(data)
+        assert loss.target_entropy == expected
+    chosen.load_state_dict(undecided)
+    chosen(data)
+    assert chosen.target_entropy == -2.0
+    spec = Bounded(-1.0, 1.0, (4,))
+    actor = ProbabilisticActor(
+        TensorDictModule(nn.Identity(), ["observation"], ["loc", "scale"]),
+        ["loc", "scale"],
+        spec=spec,
+    )
+    networks = chosen.encoder_network, chosen.qvalue_network
+    assert SACfDLoss(actor, *networks).target_entropy == -4.0
 
 
 def test_steps_to_next_obs_raises_gamma():
@@ -325,18 +349,6 @@ def test_invalid_arguments_are_refused(settings, message):
         make(**settings)
     with pytest.raises(NotImplementedError):
         make().make_value_estimator(ValueEstimators.TDLambda)
-
-
-def test_reductions_are_the_losses_of_samples_their_mean_and_their_sum():
-    data, found = batch(experts=(True,) * 4), {}
-    for reduction in ("none", "mean", "sum"):
-        found[reduction] = make(reduction=reduction, weight_norm="max")(data.clone())
-    for name in ("loss_actor", "loss_qvalue", "loss_alpha"):
-        losses = found["none"][name]
-        assert losses.shape == (4,)
-        torch.testing.assert_close(found["mean"][name], losses.mean())
-        torch.testing.assert_close(found["sum"][name], losses.sum())
-    assert found["none"]["demonstration_error"].shape == ()
 
 
 def test_in_keys_can_be_set_and_follow_renamed_keys():

@@ -17,13 +17,13 @@ from ba_torchrl.modules.actor_critic.trunk import (
     trunk_stages,
 )
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
-from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
+from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 128)
 _HIDDEN = 128
 
 
-class PlainActor(nn.Module):
+class PlainActor(XavierInitialised):
     """Gaussian policy: an image trunk, and one network each for mean and log-std.
 
     Args:
@@ -49,7 +49,7 @@ class PlainActor(nn.Module):
         return self.loc(features), scale_from_log_std(self.log_std(features))
 
 
-class PlainTwinCritic(nn.Module):
+class PlainTwinCritic(XavierInitialised):
     """Two value heads on shared features.
 
     Args:
@@ -109,7 +109,7 @@ class CNNConfig(ImageNetworkConfig):
             critic=self._critic(spec, features),
         )
         for network in networks:
-            network.apply(initialise_plain)
+            network.reset_parameters()
         return networks
 
     def _critic(self, spec: ActorCriticSpec, features: int) -> nn.Module:

@@ -9,15 +9,23 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from ba_torchrl.modules.layers import XavierInitialised
+
 
 class BatchedLinear(nn.Module):
     """A linear layer per head, computed for all heads together."""
 
     def __init__(self, heads: int, in_size: int, out_size: int) -> None:
         super().__init__()
-        bound = math.sqrt(6 / (in_size + out_size))  # Xavier, for each head
-        self.weight = nn.Parameter(torch.empty(heads, in_size, out_size).uniform_(-bound, bound))
-        self.bias = nn.Parameter(torch.zeros(heads, out_size))
+        self.weight = nn.Parameter(torch.empty(heads, in_size, out_size))
+        self.bias = nn.Parameter(torch.empty(heads, out_size))
+        self.reset_parameters()
+
+    def reset_parameters(self) -> None:
+        """Xavier-initialise the weights of each head, and set the biases to zero."""
+        bound = math.sqrt(6 / sum(self.weight.shape[1:]))
+        nn.init.uniform_(self.weight, -bound, bound)
+        nn.init.zeros_(self.bias)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [..., heads, out_size] of x [..., heads, in_size]."""
@@ -36,6 +44,11 @@ class FieldNorm(nn.Module):
         self.weight = nn.Parameter(torch.ones(heads, fields, 1))
         self.bias = nn.Parameter(torch.zeros(heads, fields, 1))
 
+    def reset_parameters(self) -> None:
+        """Set the scales to one and the shifts to zero."""
+        nn.init.ones_(self.weight)
+        nn.init.zeros_(self.bias)
+
     def forward(self, x: Tensor) -> Tensor:
         """Return x [..., heads, fields, components], normalised."""
         return F.layer_norm(x, x.shape[-2:]) * self.weight + self.bias
@@ -45,7 +58,7 @@ def _unchanged(action: Tensor) -> Tensor:
     return action
 
 
-class EnsembleCritic(nn.Module):
+class EnsembleCritic(XavierInitialised):
     """Values of an action from several critics on shared features.
 
     Each head has two hidden layers with layer normalisation before the ReLU. The hidden units of

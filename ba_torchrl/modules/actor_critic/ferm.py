@@ -14,13 +14,13 @@ from torch import Tensor, nn
 from ba_torchrl.modules.actor_critic.cnn import PlainActor, PlainTwinCritic, mlp, plain_trunk
 from ba_torchrl.modules.actor_critic.trunk import ImageNetworkConfig, ImageTrunk
 from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
-from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.layers import XavierInitialised, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 1024)
 _HIDDEN = 1024
 
 
-class FERMEncoder(nn.Module):
+class FERMEncoder(XavierInitialised):
     """Normalised features of an image."""
 
     def __init__(self, trunk: ImageTrunk, width: int, features: int) -> None:
@@ -70,5 +70,5 @@ class FERMConfig(ImageNetworkConfig):
             critic=PlainTwinCritic(mlp(features + size, hidden, hidden, 1) for _ in range(2)),
         )
         for network in networks:
-            network.apply(initialise_plain)
+            network.reset_parameters()
         return networks

@@ -18,7 +18,7 @@ from ba_torchrl.modules.base import (
     Control,
     NetworkConfig,
 )
-from ba_torchrl.modules.layers import Precision, compute_dtype
+from ba_torchrl.modules.layers import Precision, XavierInitialised, compute_dtype
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 SUPPORTED_IMAGE_SIZES = (64, 128)
@@ -95,7 +95,7 @@ class ImageNetworkConfig(NetworkConfig):
                 )
 
 
-class ImageTrunk(nn.Module):
+class ImageTrunk(XavierInitialised):
     """Depth image and holding flag to one feature vector, through convolutions.
 
     Activations are channels-last in the compute dtype; parameters stay float32 and each

@@ -15,7 +15,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.layers import initialise_plain
+from ba_torchrl.modules.layers import XavierInitialised
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
     Level,
@@ -122,7 +122,7 @@ class ASRNetworkConfig(SpatialImageConfig):
 _LARGEST_MAP = 8
 
 
-class PlainYawValues(nn.Module):
+class PlainYawValues(XavierInitialised):
     """Q values of yaws from a patch, the in-hand image and the scene feature map."""
 
     def __init__(
@@ -144,7 +144,7 @@ class PlainYawValues(nn.Module):
             hidden,
         )
         self.values = nn.Linear(hidden, 2 * num_yaws)
-        self.apply(initialise_plain)
+        self.reset_parameters()
 
     def forward(self, patch: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
         """Return values [B, yaws].

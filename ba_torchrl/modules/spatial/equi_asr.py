@@ -10,7 +10,7 @@ from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.layers import XavierInitialised, scaled_width
 from ba_torchrl.modules.spatial.asr import ASR, ASRNetworkConfig
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
@@ -23,9 +23,9 @@ from ba_torchrl.modules.spatial.in_hand import InHandVector
 from ba_torchrl.modules.spatial.views import HeightView
 from ba_torchrl.modules.steerable.layers import (
     DynamicSteerableConv2d,
+    FilterGenerator,
     SteerableConv2d,
     SteerableLinear,
-    filter_generator,
     planar_rotations,
     planar_yaws,
 )
@@ -96,7 +96,7 @@ class SceneVector(nn.Sequential):
         return super().forward(torch.cat([largest, mean], dim=1))
 
 
-class EquivariantYawValues(nn.Module):
+class EquivariantYawValues(XavierInitialised):
     """Q values of yaws, equivariant under rotations of the patch.
 
     Vectors of the scene feature map and the in-hand image determine the coefficients of a dynamic
@@ -143,8 +143,8 @@ class EquivariantYawValues(nn.Module):
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
         self.hand_linear = nn.Linear(self.hand.out_features, narrow)
         self.scene = SceneVector(scene_channels, spec.image_size, config)
-        self.apply(initialise_plain)
-        self.coefficients = filter_generator(narrow + self.scene.out_features, self.held)
+        self.reset_parameters()
+        self.coefficients = FilterGenerator(narrow + self.scene.out_features, self.held)
 
     def forward(self, patch: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
         """Return values [B, yaws].

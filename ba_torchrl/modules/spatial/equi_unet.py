@@ -9,15 +9,15 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.layers import initialise_plain, scaled_width
+from ba_torchrl.modules.layers import scaled_width
 from ba_torchrl.modules.spatial.base import SpatialImageConfig, SpatialSpec
 from ba_torchrl.modules.spatial.in_hand import InHandVector
 from ba_torchrl.modules.spatial.unet import ResidualBlock, UNet
 from ba_torchrl.modules.steerable.layers import (
     DynamicSteerableConv2d,
     FieldTypes,
+    FilterGenerator,
     SteerableConv2d,
-    filter_generator,
 )
 
 if TYPE_CHECKING:
@@ -106,10 +106,10 @@ class EquivariantPixelValues(nn.Module):
         self.scene_channels = fields[-1]
         wide = config.scaled_dense_width(1024)
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
-        self.hand.apply(initialise_plain)
+        self.hand.reset_parameters()
         self.unet = equivariant_unet(gspace, fields)
         self.held = DynamicSteerableConv2d(gspace, regular, fields[0], 3)
-        self.coefficients = filter_generator(self.hand.out_features, self.held)
+        self.coefficients = FilterGenerator(self.hand.out_features, self.held)
         self.pick = _Head(gspace, fields[0], out_repr)
         self.place = _Head(gspace, fields[0], out_repr)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.layers import CastConv2d, scaled_width
+from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 _LARGEST_LAST_MAP = 6
@@ -35,7 +35,7 @@ class InHandMap(nn.Module):
         return F.relu(self.third(x), inplace=True)
 
 
-class InHandVector(nn.Module):
+class InHandVector(XavierInitialised):
     """A feature vector of a small image: four padded 3x3 convolutions, pools and a linear layer.
 
     There are two pools for images of 24 pixels and three for 40 pixels.

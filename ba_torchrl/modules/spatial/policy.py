@@ -145,11 +145,16 @@ def _nearest_step(values: Tensor, axis: GridAxis) -> Tensor:
 class SpatialValues(nn.Module):
     """Values of actions in the environment's units, level by level.
 
+    They are the `LevelValues` of losses (`ba_torchrl.objectives.dqn`).
+
     Args:
         network: computes the values of its choices.
         actions: the bijection between its choices and the environment's actions.
         image_keys: keys of the network's input images, in the order of its arguments.
     """
+
+    action_dims = 1
+    """Number of dimensions of an action, a vector."""
 
     def __init__(
         self,
@@ -179,6 +184,20 @@ class SpatialValues(nn.Module):
             value, best = q.flatten(1).max(dim=1, keepdim=True)
             chosen = torch.cat([chosen, self.actions.unravel(best[:, 0], level)], dim=-1)
         return chosen, value
+
+    def value_of(self, *observation_and_choices: Tensor) -> Tensor:
+        """Return the last level's value, float32 [B, 1], of given choices.
+
+        Args:
+            observation_and_choices: the images [B, C, H, W] each, the holding flag [B, 1] and the
+                choices, int64 [B, n].
+        """
+        *observation, chosen = observation_and_choices
+        q, state = self.network.first(*observation)
+        last = len(self.actions.levels) - 1
+        if last:
+            q = self.network.later(last, state, self.actions.before(chosen, last))
+        return q.flatten(1).gather(1, self.actions.ravel(chosen, last)[:, None])
 
     def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return the values of every level, given the action's choices at the levels before.

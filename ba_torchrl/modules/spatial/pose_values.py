@@ -7,7 +7,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
+from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
     SpatialImageConfig,
@@ -59,7 +59,7 @@ class SceneMapVector(nn.Module):
         return self.second(F.relu(self.first(x.flatten(1).float())))
 
 
-class PoseValues(nn.Module):
+class PoseValues(XavierInitialised):
     """Q values from one or several views of the scene, the in-hand image and the scene features.
 
     Every view has its own values, by shared weights: with one view, the values of all choices; with
@@ -97,7 +97,7 @@ class PoseValues(nn.Module):
         self.narrow = nn.Linear(wide, narrow)
         self.scene = scene
         self.values = nn.Linear(narrow + scene.out_features, 2 * values_per_view)
-        self.apply(initialise_plain)
+        self.reset_parameters()
 
     def forward(self, views: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
         """Return values [B, K * values_per_view], those of the first view first.

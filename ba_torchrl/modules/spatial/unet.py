@@ -8,7 +8,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.modules.layers import CastConv2d, initialise_plain, scaled_width
+from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 from ba_torchrl.modules.spatial.base import SpatialImageConfig, SpatialSpec, select_primitive
 from ba_torchrl.modules.spatial.in_hand import InHandMap
 
@@ -85,7 +85,7 @@ def residual_block(channels: int, width: int) -> ResidualBlock:
     )
 
 
-class PlainPixelValues(nn.Module):
+class PlainPixelValues(XavierInitialised):
     """Q values of every pixel from a plain UNet on the heightmap and the in-hand image.
 
     Args:
@@ -116,7 +116,7 @@ class PlainPixelValues(nn.Module):
         self.fuse = residual_block(w8 + self.hand.out_channels, w8)
         self.head = CastConv2d(w1, 2 * maps, 1)
         self.scene_channels = w8
-        self.apply(initialise_plain)
+        self.reset_parameters()
 
     def forward(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return values and the bottleneck map.

@@ -138,12 +138,13 @@ class SteerableConv2d(nn.Module):
         if not self._blocks:
             raise ValueError("no steerable kernel maps these input fields to these output fields")
         scales = he_scales(self._blocks, in_types, out_types)
+        self._scales = {self._name(pair): scale for pair, scale in scales.items()}
         self.coefficients = nn.ParameterDict(
             {
-                self._name(pair): nn.Parameter(
-                    scale * torch.randn(self._out[pair[1]][1], self._in[pair[0]][1], len(scale))
+                self._name((i, o)): nn.Parameter(
+                    torch.empty(self._out[o][1], self._in[i][1], len(scale))
                 )
-                for pair, scale in scales.items()
+                for (i, o), scale in scales.items()
             }
         )
         self._irrep_kernels = None
@@ -154,7 +155,17 @@ class SteerableConv2d(nn.Module):
                 self._irrep_kernels = regular_irrep_kernels(gspace, in_repr)
         self._bias_block = bias_block(out_types)
         count = len(self._bias_block.kernels)
-        self.bias = nn.Parameter(torch.zeros(count)) if count else None
+        self.bias = nn.Parameter(torch.empty(count)) if count else None
+        self.reset_parameters()
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """He-initialise the coefficients, and set the biases to zero."""
+        for name, scale in self._scales.items():
+            coefficients = self.coefficients[name]
+            coefficients.copy_(scale * torch.randn(coefficients.shape, device=scale.device))
+        if self.bias is not None:
+            self.bias.zero_()
 
     @staticmethod
     def _name(pair: tuple[int, int]) -> str:
@@ -328,16 +339,23 @@ class DynamicSteerableConv2d(nn.Module):
         return y.contiguous(memory_format=torch.channels_last)
 
 
-def filter_generator(features: int, convolution: DynamicSteerableConv2d) -> nn.Linear:
-    """Return a layer from features to the coefficients of a dynamic convolution.
+class FilterGenerator(nn.Linear):
+    """A layer from features to the coefficients of a dynamic convolution.
 
     The layer's biases are He-initialised coefficients, so for zero features the convolution is an
     ordinary freshly initialised layer. For features of unit size, its weights add a term of the
     same standard deviation.
     """
-    layer = nn.Linear(features, convolution.num_coefficients)
-    scales = convolution.scales()
-    with torch.no_grad():
-        layer.bias.copy_(scales * torch.randn_like(scales))
-        layer.weight.copy_(scales[:, None] * torch.randn_like(layer.weight) / features**0.5)
-    return layer
+
+    def __init__(self, features: int, convolution: DynamicSteerableConv2d) -> None:
+        self._scales = convolution.scales()
+        super().__init__(features, convolution.num_coefficients)
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Draw weights and biases of the coefficients' standard deviations."""
+        super().reset_parameters()  # whose draws the seeds of records include
+        scales = self._scales
+        self.bias.copy_(scales * torch.randn_like(scales))
+        weight = scales[:, None] * torch.randn(self.weight.shape, device=scales.device)
+        self.weight.copy_(weight / self.in_features**0.5)
