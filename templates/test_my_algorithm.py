@@ -29,11 +29,11 @@ def test_training(tmp_path):
     errors = read_scalars(tmp_path / "run")["train/bc_loss"].values
     assert errors[-10:].mean() < errors[:10].mean()
 
-    algorithm = experiment.algorithm
-    assert {*algorithm.sample().keys(True, True)} == KEYS
-    updates = algorithm.updates
-    policy = [p.clone() for p in algorithm.trained_policy.parameters()]
-    algorithm.updates = MyAlgorithmConfig().policy_every * updates + 1
-    algorithm.update()  # of the critics alone
-    same = zip(policy, algorithm.trained_policy.parameters(), strict=True)
+    learner = experiment.learner
+    assert {*learner.sample().keys(True, True)} == KEYS
+    updates = learner.updates
+    policy = [p.clone() for p in learner.trained_policy.parameters()]
+    learner.updates = MyAlgorithmConfig().policy_every * updates + 1
+    learner.update()  # of the critics alone
+    same = zip(policy, learner.trained_policy.parameters(), strict=True)
     assert all(torch.equal(*each) for each in same)

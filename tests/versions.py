@@ -229,19 +229,19 @@ def check_update(values: dict[str, object]) -> None:
     from ba_torchrl.demonstrations import collect_demonstrations
     from ba_torchrl.envs.factory import make_vector_env
     from ba_torchrl.training.config import ExperimentConfig
-    from ba_torchrl.training.learner import build_algorithm
+    from ba_torchrl.training.learner import build_learner
 
     config = ExperimentConfig.parse(values)
-    algorithm = build_algorithm(config)
+    learner = build_learner(config)
     env = make_vector_env(config.resolved_env, 1, parallel=False, seed=0, expert=True)
     try:
-        episodes = collect_demonstrations(env, 2, seed=0, nearest_action=algorithm.nearest_action)
+        episodes = collect_demonstrations(env, 2, seed=0, nearest_action=learner.nearest_action)
     finally:
         env.close()
-    algorithm.on_demonstrations(episodes)
-    algorithm.update()
+    learner.on_demonstrations(episodes)
+    learner.update()
     if config.algorithm_config.collects:
-        algorithm.update()
+        learner.update()
 
 
 def check_quick_start() -> None:

@@ -113,18 +113,18 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
 
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import collect_demonstrations
-    from ba_torchrl.training.learner import build_algorithm
+    from ba_torchrl.training.learner import build_learner
 
-    algorithm = build_algorithm(config)
+    learner = build_learner(config)
     options = {"parallel": False, "seed": settings.seed, "expert": True}
     with closing(make_vector_env(config.resolved_env, 1, **options)) as env:
-        algorithm.on_demonstrations(collect_demonstrations(env, 5, seed=settings.seed))
+        learner.on_demonstrations(collect_demonstrations(env, 5, seed=settings.seed))
 
     def wait() -> None:
         if config.torch_device.type == "cuda":
             torch.cuda.synchronize(config.torch_device)
 
-    return _rate(algorithm.update, WARM_UP_UPDATES, settings.updates, wait)
+    return _rate(learner.update, WARM_UP_UPDATES, settings.updates, wait)
 
 
 def _rate(

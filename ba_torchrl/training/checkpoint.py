@@ -1,7 +1,7 @@
 """Files of a run: configuration, the lock on its folder, checkpoints, and the state to resume from.
 
 Checkpoints and states survive a loss of power, and are checked before they are loaded. A state has
-the algorithm (networks, optimiser, schedules, generators), its replay with priorities, the
+the learner (networks, optimiser, schedules, generators), its replay with priorities, the
 process's random number generators, the learning curve, all counters, and the position of every
 environment in its episode. On a CPU, a resumed run therefore continues bit for bit, and repeats
 what came after the last save. If a worker process had failed when the state was saved, the episodes
@@ -296,9 +296,9 @@ class Checkpoints:
     Each gets its final name when it is complete on the disk, with checksums of its files.
     """
 
-    def __init__(self, folder: Path, algorithm: Learner, keep_last: int = 2) -> None:
+    def __init__(self, folder: Path, learner: Learner, keep_last: int = 2) -> None:
         self._folder = folder
-        self._checkpoint = DurableCheckpoint(algorithm=algorithm)
+        self._checkpoint = DurableCheckpoint(algorithm=learner)
         remove_leftovers(folder / _CHECKPOINTS)
         self._rotation = CheckpointRotation(
             folder / _CHECKPOINTS, keep_last=keep_last, keep_best=("success_rate", "max")
@@ -324,7 +324,7 @@ class Checkpoints:
         return find_checkpoint(self._folder, which)
 
     def load(self, path: Path) -> None:
-        """Put the algorithm into the state of a checkpoint."""
+        """Put the learner into the state of a checkpoint."""
         self._checkpoint.load(path)
 
 
@@ -372,7 +372,7 @@ def _success_rate(checkpoint: Path) -> float:
 def load(
     path: str | Path, which: Which = "best", **changes: Any
 ) -> tuple[ExperimentConfig, Learner]:
-    """Rebuild the algorithm of a checkpoint.
+    """Rebuild the learner of a checkpoint.
 
     Args:
         path: a run folder, or one of its checkpoints.
@@ -386,9 +386,9 @@ def load(
     """
     checkpoint = find_checkpoint(path, which)
     config = read_config(checkpoint.parent.parent, **changes)
-    algorithm = build_to_load(config)
-    DurableCheckpoint(algorithm=algorithm).load(checkpoint)
-    return config, algorithm
+    learner = build_to_load(config)
+    DurableCheckpoint(algorithm=learner).load(checkpoint)
+    return config, learner
 
 
 # -- the state to resume from ------------------------------------------------------------------
@@ -401,12 +401,12 @@ class ResumeState:
     last two are kept: if the newest is damaged, the run continues from the one before.
     """
 
-    def __init__(self, folder: Path, algorithm: Learner, state: RunState) -> None:
+    def __init__(self, folder: Path, learner: Learner, state: RunState) -> None:
         self._folder = folder / _RESUME
         self._checkpoint = DurableCheckpoint(
-            algorithm=algorithm,
+            algorithm=learner,
             replay=SimpleNamespace(
-                state_dict=algorithm.replay_state, load_state_dict=algorithm.load_replay_state
+                state_dict=learner.replay_state, load_state_dict=learner.load_replay_state
             ),
             progress=state,
             generators=_Generators(),

@@ -21,7 +21,7 @@ from ba_torchrl.demonstrations.episodes import is_success
 from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.collectors.base import Collection, CollectionProblem
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 
 logger = logging.getLogger(__name__)
 
@@ -40,18 +40,18 @@ def make_env(config: ExperimentConfig, seed: int, **changes: Any) -> EnvBase:
 
 def start_collection(
     config: ExperimentConfig,
-    algorithm: Learner,
+    learner: Learner,
     seed: int,
     positions: Sequence[EpisodePosition] | None,
 ) -> Collection:
     """Start the collector of a run; see `CollectorConfig.start`."""
     values = config.model_dump(mode="json")  # which other processes read, plugins first
     problem = CollectionProblem(
-        algorithm=algorithm,
+        learner=learner,
         device=config.torch_device,
         num_envs=config.num_envs,
         seed=seed,
-        make_env=partial(_make_some_envs, values, algorithm.config.imitates == "expert_everywhere"),
+        make_env=partial(_make_some_envs, values, learner.config.imitates == "expert_everywhere"),
         make_policy=partial(_make_policy, values),
         workers=config.workers,
     )
@@ -67,7 +67,7 @@ def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: i
 
 
 def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:
-    return build_algorithm(_read(values, device="cpu", seed=seed)).policy
+    return build_learner(_read(values, device="cpu", seed=seed)).policy
 
 
 def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
@@ -77,12 +77,12 @@ def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
 
 def gather_demonstrations(
     config: ExperimentConfig,
-    algorithm: Learner,
+    learner: Learner,
     on_episode: Callable[[TensorDict], None] | None = None,
 ) -> list[TensorDict]:
     """Return the episodes [T] of a run's demonstrations, read from a folder or played now.
 
-    Those that are played have actions that the policy of ``algorithm`` can choose, and are given to
+    Those that are played have actions that the policy of ``learner`` can choose, and are given to
     ``on_episode``. If too few can be used, `ConfigError` is raised.
     """
     if config.demonstrations_path is not None:
@@ -116,7 +116,7 @@ def gather_demonstrations(
             turn_noise=config.demonstrations_turn_noise,
             turns=config.resolved_env.actions.turns,
             primitive=config.resolved_env.actions.primitive,
-            nearest_action=algorithm.nearest_action,
+            nearest_action=learner.nearest_action,
             on_episode=on_episode,
         )
     finally:

@@ -32,7 +32,7 @@ from ba_torchrl.training.collectors.base import Collection
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation, acting_on, evaluate
 from ba_torchrl.training.interruption import Interruption, StopSignals
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from ba_torchrl.training.outputs import (
     check_packages,
     expert_version,
@@ -71,14 +71,14 @@ class Experiment:
         if config.tf32 is not None:
             torch.backends.cuda.matmul.allow_tf32 = config.tf32
             torch.backends.cudnn.allow_tf32 = config.tf32
-        self.algorithm = build_algorithm(config)
+        self.learner = build_learner(config)
         if config.compile_mode is not None:
-            self.algorithm.compile(config.compile_mode)
-        self._greedy = acting_on(self.algorithm.policy, config.torch_device)
+            self.learner.compile(config.compile_mode)
+        self._greedy = acting_on(self.learner.policy, config.torch_device)
         self._lock = lock_run(config.folder)
         try:
             open_run_folder(config)
-            self.checkpoints = Checkpoints(config.folder, self.algorithm)
+            self.checkpoints = Checkpoints(config.folder, self.learner)
             self.log = ScalarLog(config.folder, config.logger, config.model_dump(mode="json"))
         except BaseException:  # a notebook keeps this object, with its lock, in the traceback
             self._lock.release()
@@ -86,7 +86,7 @@ class Experiment:
         self._collection: Collection | None = None
         self._eval_env: EnvBase | None = None
         self.state = RunState()
-        self._resume_state = ResumeState(config.folder, self.algorithm, self.state)
+        self._resume_state = ResumeState(config.folder, self.learner, self.state)
         self._phase_start, self._measured_from_s = 0, 0.0
         self._phase_name = ""
         self._signals = StopSignals()
@@ -141,7 +141,7 @@ class Experiment:
         if not self._resume_state.load():
             return False
         self._can_save = True
-        updates, state = self.algorithm.updates, self.state
+        updates, state = self.learner.updates, self.state
         state.resumed_at.append(updates)
         self._bar.update(updates)
         last = state.curve[-1] if state.curve else None
@@ -160,9 +160,9 @@ class Experiment:
     def _store_demonstrations(self) -> None:
         with self._phase("demonstrations"), self.state.timed("demonstrations"):
             episodes = gather_demonstrations(
-                self.config, self.algorithm, lambda _: self._signals.check()
+                self.config, self.learner, lambda _: self._signals.check()
             )
-            self.algorithm.on_demonstrations(episodes)
+            self.learner.on_demonstrations(episodes)
         self.state.demonstrations = len(episodes)
         self.state.demonstration_steps = sum(map(len, episodes))
         self.log.write(
@@ -175,31 +175,31 @@ class Experiment:
 
     def _learn(self) -> None:
         """Pretrain, then alternate collection and updates until the last update."""
-        config, algorithm = self.config, self.algorithm
+        config, learner = self.config, self.learner
         computed = precision(config)
         if computed not in self.state.precisions:
             self.state.precisions.append(computed)
         first = config.algorithm_config.first_updates
         collects = config.algorithm_config.collects
         offline = first + config.pretrain_updates if collects else config.total_updates
-        self._phase_start = algorithm.updates
+        self._phase_start = learner.updates
         with self._phase("pretraining"):
-            while algorithm.updates < offline and not self._is_complete:
+            while learner.updates < offline and not self._is_complete:
                 self._update()
         if self._is_complete:
             return
         with self.state.timed("collection"):
             self._collection = self._start_collection()
-        self._phase_start = algorithm.updates
+        self._phase_start = learner.updates
         with self._phase("training"):
             while not self._take_pending_updates():
                 with self.state.timed("collection"):
                     steps = self._store(next(self._collection))
-                if len(algorithm.replay) >= config.min_replay:
+                if len(learner.replay) >= config.min_replay:
                     self.state.pending_updates = steps * config.updates_per_step
                 self._stop_or_save()
-        if algorithm.updates < config.total_updates:
-            logger.info("the run ends at update %d: stop_at_success", algorithm.updates)
+        if learner.updates < config.total_updates:
+            logger.info("the run ends at update %d: stop_at_success", learner.updates)
 
     def _start_collection(self) -> Collection:
         """Start to collect, and continue the episodes of a resumed run."""
@@ -207,7 +207,7 @@ class Experiment:
         # Without positions, a resumed run plays other episodes than before its interruption.
         part = state.resumed_at[-1] if state.env_steps and state.resumed_at else 0
         seed = config.derived_seed(SeedUse.COLLECTION, part)
-        return start_collection(config, self.algorithm, seed, state.positions)
+        return start_collection(config, self.learner, seed, state.positions)
 
     def _take_pending_updates(self) -> bool:
         """Take the updates of the last step of collection; return whether the run is complete."""
@@ -219,7 +219,7 @@ class Experiment:
     @property
     def _is_complete(self) -> bool:
         """Whether all updates are taken, or the last evaluations reach `stop_at_success`."""
-        if self.algorithm.updates == self.config.total_updates:
+        if self.learner.updates == self.config.total_updates:
             return True
         target = self.config.stop_at_success
         last = [point for point in self.state.curve[-2:] if point.updates]
@@ -230,7 +230,7 @@ class Experiment:
     def _finish(self) -> RunResult:
         """Test the last policy and the best checkpoint; write the result, then curve and video."""
         config, state = self.config, self.state
-        if not state.curve or state.curve[-1].updates < self.algorithm.updates:
+        if not state.curve or state.curve[-1].updates < self.learner.updates:
             self._evaluate_and_save()
         latest, best_checkpoint = (self.checkpoints.find(which) for which in ("latest", "best"))
         self._can_save = False
@@ -243,7 +243,7 @@ class Experiment:
         def write(**pictures: Path | None) -> RunResult:
             state.add_time("other")
             files = {"checkpoint": latest, "best": best_checkpoint, **pictures}
-            return write_run_result(config, self.algorithm, last, best, state, files)
+            return write_run_result(config, self.learner, last, best, state, files)
 
         write()
         self._resume_state.remove()
@@ -290,18 +290,18 @@ class Experiment:
         state.faults += int((following[keys.FAULT] & is_present).sum())
         ended = following[keys.DONE].squeeze(-1) & ~following[keys.FAULT].squeeze(-1)
         state.recent.extend(following[keys.SUCCESS].squeeze(-1)[ended].tolist())
-        if self.algorithm.config.imitates == "expert_everywhere":
+        if self.learner.config.imitates == "expert_everywhere":
             state.expert_labels += int((is_present & ~following[keys.FAULT]).sum())
-        self.algorithm.on_collected(data)
+        self.learner.on_collected(data)
         return state.env_steps // self.config.num_envs - steps_before
 
     def _update(self) -> None:
         """Take one update; log and evaluate if they are due."""
         self._can_save = False
         with self.state.timed("updates"):
-            scalars = self.algorithm.update()
+            scalars = self.learner.update()
         self._can_save = True
-        updates = self.algorithm.updates
+        updates = self.learner.updates
         self._bar.update()
         self._log_duration()
         is_due = updates % self.config.log_every == 0
@@ -324,17 +324,17 @@ class Experiment:
         values |= {f"collector/{key}": value for key, value in collector.items()}
         if state.recent:
             values["train/success_rate"] = sum(state.recent) / len(state.recent)
-        self.log.write(self.algorithm.updates, values)
+        self.log.write(self.learner.updates, values)
 
     def _log_duration(self) -> None:
         """Log the expected duration of the remaining updates after the first ones of a phase."""
         seconds = self.state.phase_seconds["updates"] + self.state.phase_seconds["collection"]
-        taken = self.algorithm.updates - self._phase_start
+        taken = self.learner.updates - self._phase_start
         if taken == WARM_UP_UPDATES:
             self._measured_from_s = seconds
         if taken == WARM_UP_UPDATES + MEASURED_UPDATES:
             per_update = (seconds - self._measured_from_s) / MEASURED_UPDATES
-            remaining = self.config.total_updates - self.algorithm.updates
+            remaining = self.config.total_updates - self.learner.updates
             logger.info(
                 "%s: %.2f s an update, at most %.0f minutes for the other %d without evaluations",
                 compute_path(self.config),
@@ -345,7 +345,7 @@ class Experiment:
 
     def _evaluate_if_due(self) -> None:
         """Evaluate at 0 and every multiple of ``eval_every``, except at the end of the run."""
-        updates, curve = self.algorithm.updates, self.state.curve
+        updates, curve = self.learner.updates, self.state.curve
         is_new = not curve or updates > curve[-1].updates
         if is_new and updates % self.config.eval_every == 0 and updates < self.config.total_updates:
             self._evaluate_and_save()
@@ -361,7 +361,7 @@ class Experiment:
         self.state.add_time("other")
         if self._collection is not None:
             self.state.positions = self._collection.get_positions()
-        self._resume_state.save(self.algorithm.updates)
+        self._resume_state.save(self.learner.updates)
         self._last_save = time.perf_counter()
 
     def _save_if_possible(self) -> bool:
@@ -380,7 +380,7 @@ class Experiment:
 
         The untrained policy has the episodes of the first trained one.
         """
-        updates, state = self.algorithm.updates, self.state
+        updates, state = self.learner.updates, self.state
         # A run must not end because the same episodes succeed twice.
         trained = [point for point in state.curve if point.updates]
         part = 0 if self.config.stop_at_success is None else len(trained)
@@ -408,7 +408,7 @@ class Experiment:
 
     def _test(self) -> PolicyTest:
         """Test the policy under the protocol."""
-        updates, episodes = self.algorithm.updates, self.config.final_eval_episodes
+        updates, episodes = self.learner.updates, self.config.final_eval_episodes
         with self._evaluating() as env:
             return run_test(env, self._greedy, updates, episodes, lambda _: self._signals.check())
 

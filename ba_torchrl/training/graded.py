@@ -37,7 +37,7 @@ from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on, evaluate
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 
 logger = logging.getLogger(__name__)
 
@@ -221,7 +221,7 @@ def untrained(sets: GradedSets) -> tuple[ExperimentConfig, Learner]:
             **_MEDIUM[resolve_env(sets.task, sets.env).task_class.control],
         }
     )
-    return config, build_algorithm(config)
+    return config, build_learner(config)
 
 
 def half_trained(

@@ -10,8 +10,8 @@ from ba_torchrl.envs.factory import make
 from ba_torchrl.training.config import ExperimentConfig
 
 
-def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) -> Learner:
-    """Build the untrained algorithm of an experiment, of a `problem_of` that may be known already.
+def build_learner(config: ExperimentConfig, problem: Problem | None = None) -> Learner:
+    """Build the untrained learner of an experiment, of a `problem_of` that may be known already.
     `ConfigError` if task, algorithm and network do not go together."""
     problem = problem or problem_of(config)
     torch.manual_seed(config.seed)
@@ -19,7 +19,7 @@ def build_algorithm(config: ExperimentConfig, problem: Problem | None = None) ->
 
 
 def build_to_load(config: ExperimentConfig) -> Learner:
-    """Build an algorithm whose weights will be replaced; torch's generators do not change."""
+    """Build a learner whose weights will be replaced; torch's generators do not change."""
     device = config.torch_device
     with torch.device("cpu"), torch.random.fork_rng([device] if device.type == "cuda" else []):
         return _build(config, problem_of(config))
@@ -39,7 +39,7 @@ def _build(config: ExperimentConfig, problem: Problem) -> Learner:
 
 
 def problem_of(config: ExperimentConfig) -> Problem:
-    """Return what the algorithm of an experiment must know of its environment."""
+    """Return what the learner of an experiment must know of its environment."""
     env = make(config.resolved_env)
     env.close()
     return Problem(

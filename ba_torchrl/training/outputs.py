@@ -64,7 +64,7 @@ def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:
 
 def write_run_result(
     config: ExperimentConfig,
-    algorithm: Learner,
+    learner: Learner,
     last: PolicyTest,
     best: PolicyTest,
     state: RunState,
@@ -94,7 +94,7 @@ def write_run_result(
         env_steps=state.env_steps,
         expert_labels=state.expert_labels,
         precision=", then ".join(state.precisions),
-        parameters=count_parameters(algorithm.policy),
+        parameters=count_parameters(learner.policy),
         config=config.resolved(),
         versions=versions(),
         hardware=hardware(config.torch_device),

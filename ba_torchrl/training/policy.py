@@ -249,10 +249,10 @@ def load_policy(
             raise UnknownNameError("policy", str(source), shipped_policies(), hint)
     if path.suffix != POLICY_SUFFIX:
         checkpoint = find_checkpoint(path, which)
-        config, algorithm = load(checkpoint, **changes)
+        config, learner = load(checkpoint, **changes)
         versions = read_versions(checkpoint.parent.parent)
         _warn_of_version(config.task, versions)
-        return TrainedPolicy(algorithm, config, algorithm.updates, checkpoint, versions)
+        return TrainedPolicy(learner, config, learner.updates, checkpoint, versions)
     try:
         data = path.read_bytes()
         result = read_result(path) if POLICY_RESULT in header_texts(path) else None

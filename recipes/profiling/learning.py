@@ -25,7 +25,7 @@ from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import acting_on
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from profiling.limits import MatrixProduct, count_multiply_adds
 from profiling.table import CPU, Bench, Budget, Row, measurement, timed_row
 
@@ -106,7 +106,7 @@ def make_learner(
         obs_size: pixels of the images.
     """
     config = _config(bench, experiment, network, obs_size)
-    learner = build_algorithm(config)
+    learner = build_learner(config)
     learner.on_demonstrations(_expert_episodes(config.task, 20, config.env)[1])
     return learner
 
@@ -245,7 +245,7 @@ def measure_acting(bench: Bench, work: str) -> list[Row]:
     env = make_vector_env(config.task, 5, parallel=False, seed=SEED, **config.env)
     state = env.reset()
     env.close()
-    act = acting_on(build_algorithm(config).policy, bench.device)
+    act = acting_on(build_learner(config).policy, bench.device)
 
     @torch.no_grad()
     @set_exploration_type(ExplorationType.DETERMINISTIC)

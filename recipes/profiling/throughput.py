@@ -18,7 +18,7 @@ from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.vector.make import make_vector
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from profiling.simulation import SEED, SimulationUnit
 from profiling.table import Bench, Row, measurement
 
@@ -103,7 +103,7 @@ def run_collection(bench: Bench, name: str, workers: int) -> list[Row]:
     with contextlib.ExitStack() as stack:
         unit = SimulationUnit()
         stack.callback(unit.world.close)
-        batches = start_collection(config, build_algorithm(config), SEED, None)
+        batches = start_collection(config, build_learner(config), SEED, None)
         stack.callback(batches.close)
         frames, seconds, units = [], [], []
         for _ in range(WARM_UP_BATCHES):

@@ -197,7 +197,7 @@ def test_a_run_with_compile_mode(tmp_path):
 
 
 def test_a_run_without_it_is_not_compiled(tmp_path):
-    learner = make_experiment(tmp_path, "cnn", {"name": "sac"}).algorithm
+    learner = make_experiment(tmp_path, "cnn", {"name": "sac"}).learner
     assert learner.stages == [learner.loss]
 
 

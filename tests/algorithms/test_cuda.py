@@ -45,7 +45,7 @@ def test_a_run_learns_on_the_device_and_its_state_loads_on_the_cpu(
     found = parameters(learner)
     assert {value.device.type for value in found.values()} == {cuda.type}
     assert all(value.isfinite().all() for value in found.values())
-    other = make_experiment(tmp_path / "cpu", network, algorithm, **changes, device="cpu").algorithm
+    other = make_experiment(tmp_path / "cpu", network, algorithm, **changes, device="cpu").learner
     assert any(not torch.equal(value.cpu(), parameters(other)[key]) for key, value in found.items())
     other.load_state_dict(learner.state_dict())
     for key, value in parameters(other).items():

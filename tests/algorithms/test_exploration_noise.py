@@ -82,7 +82,7 @@ def test_a_run_with_noise_of_ones_own_is_evaluated_without(tmp_path, own_noise, 
     name, network = ("spatial_q", "asr") if changes is OPEN else ("sac", "cnn")
     experiment = make_experiment(tmp_path, network, {"name": name}, **changes)
     experiment.run()
-    noise = experiment.algorithm.policy.exploration
+    noise = experiment.learner.policy.exploration
     assert noise.called_under == [ExplorationType.RANDOM] * 2  # its updates, one step each
 
 

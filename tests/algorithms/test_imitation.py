@@ -32,11 +32,11 @@ def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, ne
     found = losses(tmp_path, "loss_bc")
     assert found[-5:].mean() < 0.9 * found[:5].mean()
     assert losses(tmp_path, "env_steps")[-1] == 0
-    assert made.algorithm.replay.storage.column(keys.IS_DEMONSTRATION).all()
+    assert made.learner.replay.storage.column(keys.IS_DEMONSTRATION).all()
 
 
 def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):
-    learner = make_experiment(tmp_path, "asr", {"name": "bc"}, **OPEN).algorithm
+    learner = make_experiment(tmp_path, "asr", {"name": "bc"}, **OPEN).learner
     action = torch.tensor([0.0, 0.4512, 0.0123, 0.3])
     nearest = learner.nearest_action(action)
     assert not torch.equal(nearest, action)
@@ -94,7 +94,7 @@ def test_behaviour_cloning_is_the_pretraining_of_sac(tmp_path):
     init = {"name": "bc", "updates": 30}
     algorithm = {"name": "sac", "init": init, "replay": {"name": "prioritized"}}
     made = make_experiment(tmp_path, "cnn", algorithm, total_updates=32, eval_every=32)
-    learner = made.algorithm
+    learner = made.learner
     critic = learner.loss.qvalue_network_params.clone()
     state, taken = {}, []
     minimize = learner.minimize
@@ -153,7 +153,7 @@ def test_the_expert_is_imitated_in_every_state_of_demonstrations_with_noise(
 ):
     settings = {"total_updates": 2, "eval_every": 2, **changes, "demonstrations_noise": 0.5}
     made = make_experiment(tmp_path, network, algorithm, **settings)
-    learner, imitated, episodes = made.algorithm, [], []
+    learner, imitated, episodes = made.learner, [], []
     first = [loss for updates, loss in learner.first_losses if updates]
     (loss,) = first or [learner.loss]
     key = loss.tensor_keys.action
@@ -192,7 +192,7 @@ def test_what_of_demonstrations_with_noise_counts_as_demonstrated(
     """Random actions as well, unless the loss would imitate them."""
     settings = {"demonstrations_noise": 0.5, "min_replay": 10_000, **changes}
     experiment = make_experiment(tmp_path, network, algorithm, **settings, pretrain_updates=2)
-    learner, episodes = experiment.algorithm, []
+    learner, episodes = experiment.learner, []
     store = learner.on_demonstrations
     learner.on_demonstrations = lambda each: (episodes.extend(each), store(each))
     experiment.run()

@@ -87,7 +87,7 @@ def test_a_run_stores_whole_episodes(tmp_path, collector):
     settings = {"collector": {"name": collector}, "total_updates": 20, "eval_every": 20}
     experiment = make_experiment(tmp_path, "cnn", algorithm, **settings)
     experiment.run()
-    learner = experiment.algorithm
+    learner = experiment.learner
     env_steps = experiment.state.env_steps
     ended = learner.replay.storage.column((keys.NEXT, keys.DONE)).flatten()
     is_demonstration = learner.replay.storage.column(keys.IS_DEMONSTRATION).flatten()

@@ -249,7 +249,7 @@ def test_collection_explores_and_evaluation_is_greedy(tmp_path):
     changes = {"demonstrations": 0, "total_updates": 3, "min_replay": 4, "video_episodes": 1}
     experiment = make_experiment(tmp_path, "cnn", {"name": "sac", "batch_size": 4}, **changes)
     found = []
-    experiment.algorithm.policy.register_forward_hook(lambda *_: found.append(exploration_type()))
+    experiment.learner.policy.register_forward_hook(lambda *_: found.append(exploration_type()))
     experiment.run()
     steps = int(read_scalars(tmp_path / "run")["train/env_steps"].values[-1]) // 2
     assert found.count(ExplorationType.RANDOM) == steps == 4

@@ -121,4 +121,4 @@ def run(folder, network, algorithm, **changes):
     """The learner after `make_experiment`'s run."""
     experiment = make_experiment(folder, network, algorithm, **changes)
     assert experiment.run().updates == experiment.config.total_updates
-    return experiment.algorithm
+    return experiment.learner

@@ -21,7 +21,7 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
     assert experiment.run().updates == 40
     losses = read_scalars(tmp_path / "run")["train/loss_actor"].values
     assert losses[-10:].mean() < 0.8 * losses[:10].mean()
-    stored = experiment.algorithm.replay.storage
+    stored = experiment.learner.replay.storage
     is_demonstration = stored.column(keys.IS_DEMONSTRATION)[:, 0]
     action, target = stored.column(keys.ACTION), stored.column(keys.TARGET_ACTION)
     assert torch.equal(action[is_demonstration], target[is_demonstration])
@@ -29,9 +29,7 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
     if not pretrain_updates:  # collected by the policy, labelled by the expert
         assert not torch.equal(action[~is_demonstration], target[~is_demonstration])
     _, restored = load(tmp_path / "run")
-    for a, b in zip(
-        experiment.algorithm.loss.parameters(), restored.loss.parameters(), strict=True
-    ):
+    for a, b in zip(experiment.learner.loss.parameters(), restored.loss.parameters(), strict=True):
         assert torch.equal(a, b)
 
 

@@ -23,7 +23,7 @@ from ba_torchrl.tasks.close_loop.block_reaching import BlockReaching
 from ba_torchrl.testing.episodes import play_expert
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from tests.tasks.episodes import slow
 
 PAGE = Path(__file__).parents[2] / "docs" / "plugins.md"
@@ -199,11 +199,11 @@ def test_a_wrist_camera_is_observed_stored_and_learnt_from(additions, started, t
     )
     experiment = Experiment(config, progress=False)
     assert experiment.run().updates == 6
-    sample = experiment.algorithm.replay.sample()
+    sample = experiment.learner.replay.sample()
     assert sample["wrist"].shape[1:] == sample["next", "wrist"].shape[1:] == (1, 32, 32)
     assert not torch.equal(sample["wrist"], sample["next", "wrist"])
 
 
 def test_a_network_that_sees_what_is_not_observed_is_refused():
     with pytest.raises(ConfigError, match="wrist"):
-        build_algorithm(two_views())
+        build_learner(two_views())

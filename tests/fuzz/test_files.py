@@ -16,7 +16,7 @@ from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result, run_folders
 from ba_torchrl.training.checkpoint import Checkpoints, load, write_config
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from tests.fuzz.values import JSON, check, examples
 from tests.tasks.episodes import demonstrations
 
@@ -46,8 +46,8 @@ def demos(tmp_path_factory):
 def run(tmp_path_factory):
     config = ExperimentConfig.parse({**RUN, "run_dir": str(tmp_path_factory.mktemp("run"))})
     write_config(config)
-    algorithm = build_algorithm(config)
-    Checkpoints(config.folder, algorithm).save(1, 0.5)
+    learner = build_learner(config)
+    Checkpoints(config.folder, learner).save(1, 0.5)
     return config.folder
 
 

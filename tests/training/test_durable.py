@@ -187,7 +187,7 @@ def test_a_damaged_state_falls_back_to_the_one_before(run, damage, caplog):
     assert resumable_updates(run) == 4
     damage(largest(max((run / "resume").iterdir())))
     experiment = resume(run)
-    assert experiment.algorithm.updates == 2
+    assert experiment.learner.updates == 2
     assert "passed over for the one before" in caplog.text
     assert len(list((run / "resume").iterdir())) == 1  # the damaged one is deleted
 

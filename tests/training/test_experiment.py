@@ -26,7 +26,7 @@ from ba_torchrl.training.collection import gather_demonstrations
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.evaluation import Evaluation
 from ba_torchrl.training.experiment import Experiment
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from ba_torchrl.training.precision import precision
 from tests.recipes import recipe
 from tests.tasks.episodes import demonstrations
@@ -100,14 +100,14 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
     loaded_config, loaded = load(tmp_path / "run")
     assert loaded_config == config
     assert loaded.updates == 2
-    state = experiment.algorithm.loss.state_dict()
+    state = experiment.learner.loss.state_dict()
     for key, value in loaded.loss.state_dict().items():
         assert torch.equal(value, state[key]), key
     depth = torch.rand(3, 1, 64, 64) * 0.3
     holding = torch.zeros(3, 1, dtype=torch.bool)
     observation = TensorDict({"depth": depth, "holding": holding}, batch_size=[3])
     with set_exploration_type(ExplorationType.DETERMINISTIC), torch.no_grad():
-        a = experiment.algorithm.policy(observation.clone())
+        a = experiment.learner.policy(observation.clone())
         b = loaded.policy(observation.clone())
     assert torch.equal(a["action"], b["action"])
     assert set(a.keys()) == {"depth", "holding", "action"}
@@ -115,7 +115,7 @@ def test_a_checkpoint_rebuilds_the_policy(tmp_path):
 
 def test_the_best_checkpoint_is_kept(tmp_path):
     config = tiny(tmp_path)
-    checkpoints = Checkpoints(config.folder, build_algorithm(config), keep_last=1)
+    checkpoints = Checkpoints(config.folder, build_learner(config), keep_last=1)
     for updates, rate in ((1, 0.9), (2, 0.1), (3, 0.2)):
         checkpoints.save(updates, rate)
     kept = sorted(path.name[-1] for path in (config.folder / "checkpoints").iterdir())
@@ -128,7 +128,7 @@ def test_the_last_policy_and_the_best_checkpoint_are_tested(tmp_path, monkeypatc
     weights = []
 
     def note():
-        weights.append(next(experiment.algorithm.loss.parameters()).detach().clone())
+        weights.append(next(experiment.learner.loss.parameters()).detach().clone())
 
     def evaluate(env, policy, episodes, seed, on_episode):
         note()
@@ -149,7 +149,7 @@ def test_the_last_policy_and_the_best_checkpoint_are_tested(tmp_path, monkeypatc
     assert torch.equal(weights[3], weights[2])
     assert torch.equal(weights[4], weights[1])
     assert not torch.equal(weights[2], weights[1])
-    assert torch.equal(next(experiment.algorithm.loss.parameters()), weights[2])
+    assert torch.equal(next(experiment.learner.loss.parameters()), weights[2])
     assert read_result(tmp_path / "run") == result
 
 
@@ -172,7 +172,7 @@ def test_a_result_counts_what_the_run_used(tmp_path, changes, labels, expert):
     assert result.expert_labels == labels
     assert result.env_steps == result.curve[-1].env_steps
     assert result.precision == precision(config)
-    policy = experiment.algorithm.policy
+    policy = experiment.learner.policy
     assert result.parameters == sum(value.numel() for value in policy.parameters()) > 0
     assert result.last.seeds == [protocol.test_seed(episode) for episode in range(4)]
     assert set(result.phase_seconds) == set(get_args(Phase))
@@ -259,11 +259,11 @@ def test_demonstrations_of_a_folder_are_filtered(tmp_path, caplog):
         tiny(tmp_path, demonstrations_path=str(tmp_path / name), **changes)
         for name in ("good", "bad")
     )
-    algorithm = build_algorithm(good)
-    assert len(gather_demonstrations(good, algorithm)) == 3
+    learner = build_learner(good)
+    assert len(gather_demonstrations(good, learner)) == 3
     assert "demonstrations_turn_noise has no effect" in caplog.text
     with pytest.raises(ConfigError, match=r"0 episodes of .* succeed, \d are needed"):
-        gather_demonstrations(bad, algorithm)
+        gather_demonstrations(bad, learner)
 
 
 def test_demonstrations_of_another_library_are_those_of_the_folder(tmp_path):
@@ -289,7 +289,7 @@ def test_demonstrations_of_another_library_are_those_of_the_folder(tmp_path):
         ),
     ]
     for run in runs:
-        found = gather_demonstrations(run, build_algorithm(run))
+        found = gather_demonstrations(run, build_learner(run))
         for one, other in zip(found, episodes, strict=True):
             assert (one == other).all()
     with pytest.raises(ConfigError, match=r"written by another program.*obs/depth \[64, 64, 1\]"):
@@ -348,8 +348,8 @@ def test_an_open_loop_run_from_either_source(tmp_path, source):
     assert result.last.episodes == 1
     scalars = read_scalars(tmp_path / "run")
     assert scalars["demonstrations/success_rate"].values == [1.0]
-    _, algorithm = load(tmp_path / "run")
-    assert algorithm.updates == 3
+    _, learner = load(tmp_path / "run")
+    assert learner.updates == 3
 
 
 @pytest.mark.parametrize(
@@ -385,7 +385,7 @@ def test_seeds_of_different_uses_and_runs_differ(tmp_path):
 def test_a_loss_that_is_not_finite_stops_the_run(tmp_path):
     experiment = Experiment(tiny(tmp_path, video_episodes=0), progress=False)
     with torch.no_grad():
-        experiment.algorithm.loss.log_alpha.fill_(float("nan"))
+        experiment.learner.loss.log_alpha.fill_(float("nan"))
     with pytest.raises(FloatingPointError, match="update 0"):
         experiment.run()
 

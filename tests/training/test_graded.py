@@ -120,9 +120,9 @@ def test_no_seed_of_a_set_is_one_of_a_run():
 def test_training_of_medium_goes_back_where_success_passes_over_half(
     sets, rates, monkeypatch, tmp_path
 ):
-    build, learners = graded.build_algorithm, []
+    build, learners = graded.build_learner, []
     monkeypatch.setattr(
-        graded, "build_algorithm", lambda config: learners.append(build(config)) or learners[0]
+        graded, "build_learner", lambda config: learners.append(build(config)) or learners[0]
     )
     rates[:] = [0.1, 0.9, 0.5]
     _, text = graded.half_trained(GradedSets(tmp_path, TASK, 4, ENV), None, sets["expert"])

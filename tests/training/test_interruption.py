@@ -62,7 +62,7 @@ def config_for(folder, base=SAC, **changes):
 def outcome(experiment):
     """Return all that a run learnt and recorded."""
     folder = experiment.config.folder
-    state = experiment.algorithm.state_dict()
+    state = experiment.learner.state_dict()
     excluded = {"seconds", "phase_seconds", "finished", "resumed_at", "files", "config", "curve"}
     excluded |= {"versions"}  # with the commit, which may change between two runs
     result = read_result(folder).model_dump(exclude=excluded)
@@ -125,7 +125,7 @@ def undisturbed(tmp_path_factory):
 @pytest.mark.parametrize("after", [20, *slow([1, 3, 4])])
 def test_a_run_that_was_stopped_by_a_signal_ends_with_the_same_bits(tmp_path, undisturbed, after):
     experiment = Experiment(config_for(tmp_path), progress=False)
-    at_call(experiment, experiment.algorithm, "update", after, terminate)
+    at_call(experiment, experiment.learner, "update", after, terminate)
     with pytest.raises(RunStopped, match=r"^stopped by SIGTERM, state saved: .*$") as stopped:
         experiment.run()
     assert stopped.value.code == 128 + signal.SIGTERM
@@ -160,11 +160,11 @@ FERM = {
 def test_other_parts_of_an_algorithm_continue_with_the_same_bits(tmp_path, changes):
     whole = run(config_for(tmp_path / "whole", **changes))
     experiment = Experiment(config_for(tmp_path / "run", **changes), progress=False)
-    at_call(experiment, experiment.algorithm, "update", 10, terminate)
+    at_call(experiment, experiment.learner, "update", 10, terminate)
     with pytest.raises(RunStopped):
         experiment.run()
     if changes is SELF_IMITATION:
-        assert len(experiment.algorithm.episodes) > 0  # unfinished ones
+        assert len(experiment.learner.episodes) > 0  # unfinished ones
     assert_same(run(config_for(tmp_path / "run", **changes, resume=True)), whole)
 
 
@@ -172,7 +172,7 @@ def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undi
     for number in (3, 2, 5, 4):  # updates until the kill
         config = config_for(tmp_path, resume=True, save_minutes=1e-9)
         experiment = Experiment(config, progress=False)
-        at_call(experiment, experiment.algorithm, "update", number, kill)
+        at_call(experiment, experiment.learner, "update", number, kill)
         with pytest.raises(Killed):
             experiment.run()
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
@@ -185,7 +185,7 @@ def test_a_run_that_was_killed_counts_each_label_once(tmp_path):
     assert (whole[1]["demonstrations"], whole[1]["demonstration_steps"] >= 2) == (2, True)
     config = config_for(tmp_path / "run", **options, resume=True, save_minutes=1e-9)
     experiment = Experiment(config, progress=False)
-    at_call(experiment, experiment.algorithm, "update", 11, kill)
+    at_call(experiment, experiment.learner, "update", 11, kill)
     with pytest.raises(Killed):
         experiment.run()
     assert_same(run(config), whole)
@@ -243,7 +243,7 @@ def test_open_loop_in_worker_processes_continues_with_the_same_bits(tmp_path):
     options = {"base": SDQFD, "parallel": True, "start_method": "fork", "updates_per_step": 1}
     whole = run(config_for(tmp_path / "whole", **options))
     experiment = Experiment(config_for(tmp_path / "run", **options), progress=False)
-    at_call(experiment, experiment.algorithm, "update", 11, terminate)
+    at_call(experiment, experiment.learner, "update", 11, terminate)
     with pytest.raises(RunStopped):
         experiment.run()
     assert_same(run(config_for(tmp_path / "run", resume=True, **options)), whole)
@@ -251,7 +251,7 @@ def test_open_loop_in_worker_processes_continues_with_the_same_bits(tmp_path):
 
 def test_repeated_signals_do_not_interrupt_the_save(tmp_path, undisturbed):
     experiment = Experiment(config_for(tmp_path), progress=False)
-    at_call(experiment, experiment.algorithm, "update", 9, terminate)
+    at_call(experiment, experiment.learner, "update", 9, terminate)
     at_call(
         experiment, experiment._resume_state, "save", 2, terminate
     )  # the first is at an evaluation
@@ -277,7 +277,7 @@ def test_an_error_in_the_collection_saves_the_state(tmp_path, undisturbed):
     at_call(experiment, experiment, "_store", 13, fail)
     with pytest.raises(RuntimeError, match="worker 0"):
         experiment.run()
-    updates = experiment.algorithm.updates
+    updates = experiment.learner.updates
     assert updates > 2
     assert resumable_updates(tmp_path) == updates
     assert Experiment(config_for(tmp_path, resume=True), progress=False)._resume()
@@ -316,7 +316,7 @@ def test_a_failing_update_is_not_saved(tmp_path):
     def fail():
         raise FloatingPointError("a loss is not finite")
 
-    at_call(experiment, experiment.algorithm, "update", 12, fail)
+    at_call(experiment, experiment.learner, "update", 12, fail)
     with pytest.raises(FloatingPointError):
         experiment.run()
     assert resumable_updates(tmp_path) == 8  # of the last evaluation

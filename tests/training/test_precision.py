@@ -70,7 +70,7 @@ def test_a_run_logs_how_long_its_updates_will_take(tmp_path, caplog, monkeypatch
                 now[0] += 1000.0 if update <= 2 else 6.0
             with run.state.timed("evaluation"):
                 now[0] += 50.0
-            run.algorithm.updates = update
+            run.learner.updates = update
             run._log_duration()
     (found,) = caplog.messages
     assert "6.00 s an update, at most 10 minutes for the other 95 without evaluations" in found

@@ -48,14 +48,14 @@ def run(config):
 def interrupt(config, after):
     """Run for a number of updates, then interrupt the run; return the experiment."""
     experiment = Experiment(config, progress=False)
-    update = experiment.algorithm.update
+    update = experiment.learner.update
 
     def update_or_stop():
-        if experiment.algorithm.updates == after:
+        if experiment.learner.updates == after:
             raise Interrupted
         return update()
 
-    experiment.algorithm.update = update_or_stop
+    experiment.learner.update = update_or_stop
     with pytest.raises(Interrupted):
         experiment.run()
     return experiment
@@ -107,7 +107,7 @@ def test_an_interruption_after_the_last_evaluation_repeats_no_update(tmp_path):
     state.rename(disk)
     state.symlink_to(disk)
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
-    experiment.algorithm.update = None
+    experiment.learner.update = None
     assert experiment.run().updates == 9
     result = read_result(config.folder)
     assert [point.updates for point in result.curve] == [0, 3, 6, 9]
@@ -195,8 +195,8 @@ def test_a_run_begun_on_cuda_resumes_on_a_cpu(tmp_path, monkeypatch, caplog):
     assert result.updates == 9
     assert read_result(config.folder).resumed_at == [3]
     assert "torch_cuda not restored" in caplog.text
-    _, algorithm = load(config.folder, "latest")
-    assert {parameter.device.type for parameter in algorithm.loss.parameters()} == {"cpu"}
+    _, learner = load(config.folder, "latest")
+    assert {parameter.device.type for parameter in learner.loss.parameters()} == {"cpu"}
 
 
 def test_a_folder_with_a_run_is_not_overwritten(interrupted, tmp_path):

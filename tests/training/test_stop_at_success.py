@@ -66,5 +66,5 @@ def test_a_run_that_has_ended_takes_no_update_when_it_is_resumed(tmp_path, seeds
         with pytest.raises(Interrupted):
             first.run()
     experiment = Experiment(config_for(tmp_path, resume=True), progress=False)
-    experiment.algorithm.update = None
+    experiment.learner.update = None
     assert experiment.run().updates == 8

@@ -22,10 +22,10 @@ from ba_torchrl.envs.episode_positions import EpisodePosition
 class CollectionProblem:
     """What a collector needs of a run."""
 
-    algorithm: Learner
+    learner: Learner
     """Its policy explores, with the weights after the latest update."""
     device: torch.device
-    """Device of the algorithm."""
+    """Device of the learner."""
     num_envs: int
     """Number of environments."""
     seed: int

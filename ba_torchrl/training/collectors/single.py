@@ -49,7 +49,7 @@ class SingleCollection(Collection):
             self.env.continue_from(positions)
         self._collector = Collector(
             self.env,
-            problem.algorithm.policy,
+            problem.learner.policy,
             frames_per_batch=problem.num_envs,
             total_frames=-1,
             postproc=lambda data: data.reshape(-1),

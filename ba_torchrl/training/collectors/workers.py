@@ -92,7 +92,7 @@ class WorkerCollection(Collection):
         super().__init__()
         self.problem = problem
         self.config = config
-        self.policy = VersionedPolicy(problem.algorithm.policy)
+        self.policy = VersionedPolicy(problem.learner.policy)
         self.scalars = {"lag": 0.0, "restarts": 0}
         self._disturbed_in_a_row = 0
         """Number of restarts since the end of an undisturbed episode."""
@@ -107,7 +107,7 @@ class WorkerCollection(Collection):
             following = batch[keys.NEXT]
             if (following[keys.DONE] & ~following[keys.FAULT]).any():
                 self._disturbed_in_a_row = 0
-            self.scalars["lag"] = (self.problem.algorithm.updates - version).float().mean().item()
+            self.scalars["lag"] = (self.problem.learner.updates - version).float().mean().item()
             return batch
 
     @abstractmethod
@@ -128,7 +128,7 @@ class WorkerCollection(Collection):
 
     def weights(self) -> TensorDict:
         """Return a copy of the weights and their version, on the CPU."""
-        self.policy.version.fill_(self.problem.algorithm.updates)
+        self.policy.version.fill_(self.problem.learner.updates)
         return TensorDict.from_module(self.policy).data.to("cpu").clone()
 
     def make_envs(

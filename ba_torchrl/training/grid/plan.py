@@ -297,7 +297,7 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
     """
     import torch
 
-    from ba_torchrl.training.learner import build_algorithm, problem_of
+    from ba_torchrl.training.learner import build_learner, problem_of
 
     problems: dict[tuple[str, str], Problem] = {}
     built = set()
@@ -314,7 +314,7 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
             learner = repr((problem, run.algorithm_config, run.network_config))
             if learner not in built:
                 built.add(learner)
-                build_algorithm(run, problem)
+                build_learner(run, problem)
         except ConfigError as error:
             raise ConfigError(f"{run.task} with {run.label}: {error}") from None
 

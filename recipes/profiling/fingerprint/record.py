@@ -355,12 +355,12 @@ def run_training(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> N
     facts["updates"] = result.updates
     for name in ("episodes", "success_rate", "mean_length"):
         facts[f"evaluation {name}"] = getattr(result.last, name)
-    algorithm = experiment.algorithm
-    augmentation = algorithm.replay.transform.state_dict()
-    for name, state in {**algorithm.state_dict(), "augmentation": augmentation}.items():
+    learner = experiment.learner
+    augmentation = learner.replay.transform.state_dict()
+    for name, state in {**learner.state_dict(), "augmentation": augmentation}.items():
         if any(True for _ in tensors(state)):
             facts[f"tensors of {name}"] = tensors_mark(state)
-    facts["tensors of the policy"] = tensors_mark(algorithm.policy.state_dict())
+    facts["tensors of the policy"] = tensors_mark(learner.policy.state_dict())
 
 
 RUNNERS: dict[str, Callable[[Case, dict[str, Any], dict[str, Any]], None]] = {

@@ -5,7 +5,7 @@ import torch
 from ba_torchrl.core import keys
 from ba_torchrl.training.collection import start_collection
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.learner import build_algorithm
+from ba_torchrl.training.learner import build_learner
 from tests.training import test_experiment
 
 SEED = 7
@@ -28,27 +28,27 @@ def config_for(tmp_path, collector, **changes):
 
 
 def start(config):
-    """Return the collection of a run, and its algorithm."""
-    algorithm = build_algorithm(config)
-    return start_collection(config, algorithm, SEED, None), algorithm
+    """Return the collection of a run, and its learner."""
+    learner = build_learner(config)
+    return start_collection(config, learner, SEED, None), learner
 
 
-def change_weights(algorithm, updates):
+def change_weights(learner, updates):
     """Set the weights that the policy has after a number of updates; it acts with its means."""
     torch.manual_seed(updates)
     with torch.no_grad():
-        for name, parameter in algorithm.policy.named_parameters():
+        for name, parameter in learner.policy.named_parameters():
             parameter.add_(0.1 * torch.randn_like(parameter))
             if "log_std" in name:
                 parameter.fill_(-1e3 if "bias" in name else 0.0)
-    algorithm.policy.beta.fill_(0.0)
-    algorithm.updates = updates
+    learner.policy.beta.fill_(0.0)
+    learner.updates = updates
 
 
-def own_actions(algorithm, batch):
+def own_actions(learner, batch):
     """Return the actions of the learner's policy in the states of a batch."""
-    state = batch.select(*algorithm.policy.in_keys)
-    return algorithm.policy(state)[keys.ACTION]
+    state = batch.select(*learner.policy.in_keys)
+    return learner.policy(state)[keys.ACTION]
 
 
 def assert_each_transition_once(batches):

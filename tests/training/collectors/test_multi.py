@@ -40,9 +40,9 @@ def collecting(tmp_path):
 
     def of(name, workers=2, **changes):
         options = {} if name == "single" else {"workers": workers}
-        collection, algorithm = start(config_for(tmp_path, {"name": name, **options}, **changes))
+        collection, learner = start(config_for(tmp_path, {"name": name, **options}, **changes))
         started.append(collection)
-        return collection, algorithm
+        return collection, learner
 
     yield of
     for collection in started:
@@ -62,8 +62,8 @@ def test_environments_of_a_worker_step_in_its_process_by_default(collecting, mon
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_transition_is_returned_once_and_workers_get_the_weights(kind, collecting):
-    collection, algorithm = collecting(kind)
-    algorithm.policy.beta.fill_(1.0)
+    collection, learner = collecting(kind)
+    learner.policy.beta.fill_(1.0)
     size = {"multi_sync": 4, "multi_async": 2}[kind]
     batches = [next(collection) for _ in range(4)]
     if kind == "multi_async":
@@ -74,7 +74,7 @@ def test_every_transition_is_returned_once_and_workers_get_the_weights(kind, col
     for batch in batches:  # beta is one of the weights
         assert torch.allclose(batch[keys.ACTION], batch[keys.EXPERT_ACTION], atol=1e-6)
 
-    change_weights(algorithm, updates=3)
+    change_weights(learner, updates=3)
     later = []
     for _ in range(6):
         later.append(next(collection))
@@ -82,7 +82,7 @@ def test_every_transition_is_returned_once_and_workers_get_the_weights(kind, col
             break
     # a worker of an asynchronous collector is one batch ahead, which may wait in the queue
     assert len(later) == 1 if kind == "multi_sync" else len(later) <= 4
-    assert torch.allclose(later[-1][keys.ACTION], own_actions(algorithm, later[-1]), atol=1e-6)
+    assert torch.allclose(later[-1][keys.ACTION], own_actions(learner, later[-1]), atol=1e-6)
     assert_each_transition_once([*batches, *later])
     assert collection.scalars["restarts"] == 0
 
@@ -114,9 +114,9 @@ def test_workers_draw_different_exploration(collecting):
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_ended_workers_are_replaced_with_the_present_weights(kind, collecting):
-    collection, algorithm = collecting(kind)
+    collection, learner = collecting(kind)
     before = [next(collection) for _ in range(3)]
-    change_weights(algorithm, updates=5)
+    change_weights(learner, updates=5)
     pids = collection.worker_pids
     os.kill(pids[0], signal.SIGKILL)
     after = []
@@ -127,7 +127,7 @@ def test_ended_workers_are_replaced_with_the_present_weights(kind, collecting):
     assert not set(pids) & set(collection.worker_pids)
     assert not any(os.path.exists(f"/proc/{pid}") for pid in pids)
     new = [after[-1], *(next(collection) for _ in range(4))]
-    assert torch.allclose(new[0][keys.ACTION], own_actions(algorithm, new[0]), atol=1e-6)
+    assert torch.allclose(new[0][keys.ACTION], own_actions(learner, new[0]), atol=1e-6)
     assert_each_transition_once(new)
     first = torch.cat([batch[keys.DEPTH] for batch in before])
     assert not (new[0][keys.DEPTH][:, None] == first[None]).flatten(2).all(2).any()
@@ -268,9 +268,9 @@ def test_a_run_keeps_the_ratio_of_updates_to_steps_and_its_statistics(tmp_path):
     assert result.updates == 12
     steps = experiment.state.env_steps
     assert 4 * 12 <= steps <= 4 * 12 + 4  # one update for each step of all four environments
-    storage = experiment.algorithm.replay.storage
+    storage = experiment.learner.replay.storage
     is_demonstration = storage.column("is_demonstration")
-    assert len(experiment.algorithm.replay) == int(is_demonstration.sum()) + steps
+    assert len(experiment.learner.replay) == int(is_demonstration.sum()) + steps
     assert len(experiment.state.recent) >= 4  # episodes of at most five steps
     scalars = read_scalars(tmp_path / "run")
     assert scalars["collector/lag"].values[-1] <= 3

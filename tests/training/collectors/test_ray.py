@@ -62,13 +62,13 @@ def nodes_of_workers(ray):
 @pytest.mark.slow
 def test_collection_goes_on_when_a_node_fails(tmp_path):
     with ray_nodes(3) as (cluster, nodes, ray):
-        collection, algorithm = start(config_for(tmp_path, OPTIONS))
+        collection, learner = start(config_for(tmp_path, OPTIONS))
         batches = [next(collection) for _ in range(6)]
-        change_weights(algorithm, updates=5)
+        change_weights(learner, updates=5)
         batches += [next(collection) for _ in range(4)]  # two of each worker, or more of one
         newest = batches[-1]
         assert collection.scalars["lag"] == 0
-        assert torch.allclose(newest[keys.ACTION], own_actions(algorithm, newest), atol=1e-6)
+        assert torch.allclose(newest[keys.ACTION], own_actions(learner, newest), atol=1e-6)
         data = torch.cat(batches)
         rows = torch.cat([data[keys.DEPTH].flatten(1), data[keys.ACTION]], dim=1)
         assert len(rows.unique(dim=0)) == len(rows) == 2 * len(batches)
@@ -85,7 +85,7 @@ def test_collection_goes_on_when_a_node_fails(tmp_path):
         while not collection.scalars["restarts"] and time.monotonic() < deadline:
             batch = next(collection)
             during += 1
-            assert torch.allclose(batch[keys.ACTION], own_actions(algorithm, batch), atol=1e-6)
+            assert torch.allclose(batch[keys.ACTION], own_actions(learner, batch), atol=1e-6)
         assert collection.scalars == {"restarts": 1, "lag": 0.0}
         assert during > 1  # of the other worker
         assert failing.node_id not in nodes_of_workers(ray)
@@ -101,7 +101,7 @@ def test_a_run_on_a_cluster_ends_like_every_run(tmp_path):
         assert result.updates == 12
         steps = experiment.state.env_steps
         assert 4 * 12 <= steps <= 4 * 12 + 4
-        is_demonstration = experiment.algorithm.replay.storage.column("is_demonstration")
-        assert len(experiment.algorithm.replay) == int(is_demonstration.sum()) + steps
+        is_demonstration = experiment.learner.replay.storage.column("is_demonstration")
+        assert len(experiment.learner.replay) == int(is_demonstration.sum()) + steps
         with pytest.raises(ConfigError, match="4 CPUs are needed, the Ray cluster has 2"):
             start(config_for(tmp_path, {**OPTIONS, "workers": 4}))
