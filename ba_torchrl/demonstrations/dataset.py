@@ -32,6 +32,19 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
         split_trajs: items are episodes, padded to the longest, with ``mask``; else transitions.
         options: as for `TensorDictReplayBuffer`, such as ``sampler`` or ``transform``; the writer
             refuses to write by default.
+
+    Examples:
+        >>> import tempfile
+        >>> from ba_torchrl.demonstrations import BulletArmExperienceReplay, save_demonstrations
+        >>> from ba_torchrl import make
+        >>> task, settings = "close_loop/block_reaching", {"obs_size": 64, "max_steps": 4}
+        >>> env = make(task, **settings)
+        >>> episodes, root = [env.rollout(4), env.rollout(4)], tempfile.mkdtemp()
+        >>> save_demonstrations(f"{root}/demos", episodes, task=task, env=settings, seed=0)
+        >>> replay = BulletArmExperienceReplay("demos", batch_size=16, root=root)
+        >>> len(replay), replay.sample()["next", "depth"].shape
+        (8, torch.Size([16, 1, 64, 64]))
+        >>> env.close()
     """
 
     def __init__(

@@ -89,6 +89,15 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     Raises:
         ConfigError: the task or a parameter is unknown, its value cannot be used, or the workspace
             does not suit the objects or the robot.
+
+    Examples:
+        >>> from ba_torchrl import BulletArmEnv
+        >>> env = BulletArmEnv("open_loop/block_stacking", seed=0, expert=True)
+        >>> state = env.reset()
+        >>> step = env.step(state.set("action", state["expert_action"]))
+        >>> state["heightmap"].shape, bool(step["next", "holding"])
+        (torch.Size([1, 128, 128]), True)
+        >>> env.close()
     """
 
     _supports_set_state = True

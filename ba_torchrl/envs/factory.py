@@ -26,6 +26,14 @@ def make(task: str | ResolvedEnv, **config: Any) -> BulletArmEnv:
             `resolve_env` returned.
         config: fields of `ba_torchrl.core.env_config.EnvConfig` and of the task's own parameters,
             such as ``robot="kuka"``, ``obs_size=64``, ``seed=0`` or ``expert=True``; and ``device``
+
+    Examples:
+        >>> from ba_torchrl import make
+        >>> env = make("close_loop/block_reaching", obs_size=64, seed=0)
+        >>> steps = env.rollout(3)  # random actions
+        >>> steps["depth"].shape, steps["next", "reward"].shape
+        (torch.Size([3, 1, 64, 64]), torch.Size([3, 1]))
+        >>> env.close()
     """
     return BulletArmEnv(task, **config)
 
@@ -56,6 +64,13 @@ def make_vector_env(
         device: of the vector's TensorDicts, the CPU by default.
         options: as for `make`, and single fields of `ba_torchrl.core.config.WorkerOptions`, such as
             ``parallel=False`` or ``timeout_s=120``.
+
+    Examples:
+        >>> from ba_torchrl import make_vector_env
+        >>> env = make_vector_env("close_loop/block_reaching", 2, parallel=False, obs_size=64)
+        >>> env.rollout(3, break_when_any_done=False)["action"].shape
+        torch.Size([2, 3, 5])
+        >>> env.close()
     """
     of_workers = {name: options.pop(name) for name in WorkerOptions.model_fields if name in options}
     if not isinstance(workers, WorkerOptions | None):

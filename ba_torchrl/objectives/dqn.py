@@ -52,6 +52,15 @@ class SingleLevelValues(nn.Module):
 
     Raises:
         ValueError: the actor has another action space.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import QValueActor
+        >>> from ba_torchrl.objectives import SingleLevelValues
+        >>> values = SingleLevelValues(QValueActor(torch.nn.Linear(3, 5), action_space="one_hot"))
+        >>> choice, value = values.greedy(torch.rand(8, 3))
+        >>> choice.shape, value.shape
+        (torch.Size([8, 1]), torch.Size([8, 1]))
     """
 
     def __init__(self, actor: QValueActor) -> None:
@@ -167,6 +176,25 @@ class LevelDQNLoss(TransitionLoss):
         double_dqn: whether the online network chooses the actions whose values the target network
             computes.
         options: of `TransitionLoss`; the formulas above are for the reduction "mean".
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import QValueActor
+        >>> from torchrl.objectives import HardUpdate
+        >>> from ba_torchrl.objectives import LevelDQNLoss
+        >>> actor = QValueActor(torch.nn.Linear(3, 5), action_space="categorical")
+        >>> loss = LevelDQNLoss(actor, demonstrations="sdqfd", double_dqn=True)
+        >>> loss = loss.make_value_estimator(gamma=0.95)
+        >>> updater = HardUpdate(loss, value_network_update_interval=100)
+        >>> ends, flag = torch.zeros(8, 1, dtype=torch.bool), torch.ones(8, 1, dtype=torch.bool)
+        >>> losses = loss(
+        ...     observation=torch.rand(8, 3), action=torch.randint(5, (8,)),
+        ...     next_observation=torch.rand(8, 3), next_reward=torch.rand(8, 1),
+        ...     next_done=ends, next_terminated=ends, is_demonstration=flag,
+        ... )
+        >>> loss.out_keys[:2]
+        ['loss_qvalue', 'loss_demonstration']
+        >>> (losses[0] + losses[1]).backward()
     """
 
     value_network: nn.Module

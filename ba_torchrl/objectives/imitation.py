@@ -67,6 +67,18 @@ class BehaviourCloningLoss(_ImitationLoss):
         distance: of actions.
         entropy_weight: weight w of the negative entropy of the policy.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import ProbabilisticActor, TanhNormal
+        >>> from ba_torchrl.objectives import BehaviourCloningLoss
+        >>> actor = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
+        >>> actor = TensorDictModule(actor, ["observation"], ["loc", "scale"])
+        >>> actor = ProbabilisticActor(actor, ["loc", "scale"], distribution_class=TanhNormal)
+        >>> loss = BehaviourCloningLoss(actor, distance="kl", reduction="none")
+        >>> loss(observation=torch.rand(8, 3), action=torch.rand(8, 2)).shape
+        torch.Size([8])
     """
 
     actor_network: ProbabilisticTensorDictSequential
@@ -131,6 +143,15 @@ class LevelCrossEntropyLoss(_ImitationLoss):
         value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
             single level, see `SingleLevelValues`.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.modules import QValueActor
+        >>> from ba_torchrl.objectives import LevelCrossEntropyLoss
+        >>> actor = QValueActor(torch.nn.Linear(3, 5), action_space="categorical")
+        >>> loss = LevelCrossEntropyLoss(actor)
+        >>> loss_bc, accuracy = loss(observation=torch.rand(8, 3), action=torch.randint(5, (8,)))
+        >>> loss_bc.backward()
     """
 
     value_network: nn.Module

@@ -34,6 +34,27 @@ class RLPDLoss(SACfDLoss):
         entropy_backup: whether the target has the entropy term.
         demonstration_weight: weight of the behaviour term, which RLPD does not have.
         options: of `SACfDLoss`.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
+        >>> from ba_torchrl.objectives import RLPDLoss
+        >>> actor = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
+        >>> actor = TensorDictModule(actor, ["observation"], ["loc", "scale"])
+        >>> actor = ProbabilisticActor(actor, ["loc", "scale"], distribution_class=TanhNormal)
+        >>> encoder = TensorDictModule(torch.nn.Linear(3, 8), ["observation"], ["features"])
+        >>> critics = MLP(in_features=8 + 2, out_features=10, num_cells=[16])
+        >>> critics = TensorDictModule(critics, ["features", "action"], ["state_action_value"])
+        >>> loss = RLPDLoss(actor, encoder, critics, subset=2)
+        >>> batch = {"observation": torch.rand(16, 3), "action": torch.rand(16, 2)}
+        >>> ends = torch.zeros(16, 1, dtype=torch.bool)
+        >>> batch["next"] = {"observation": torch.rand(16, 3), "reward": torch.rand(16, 1)}
+        >>> batch["next"] |= {"done": ends, "terminated": ends}
+        >>> losses = loss(TensorDict(batch, [16]))
+        >>> losses["loss_qvalue"].shape, losses["q_std"].shape
+        (torch.Size([]), torch.Size([]))
     """
 
     out_keys = ("loss_actor", "loss_qvalue", "loss_alpha", "alpha", "entropy", "q_value", "q_std")

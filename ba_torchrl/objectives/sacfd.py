@@ -77,6 +77,29 @@ class SACfDLoss(TransitionLoss):
     Raises:
         ValueError: ``alpha_init`` is not positive, ``demonstration_distance`` is unknown, or the
             encoder has several outputs.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from tensordict.nn import NormalParamExtractor, TensorDictModule
+        >>> from torchrl.modules import MLP, ProbabilisticActor, TanhNormal
+        >>> from ba_torchrl.objectives import SACfDLoss
+        >>> actor = torch.nn.Sequential(torch.nn.Linear(3, 4), NormalParamExtractor())
+        >>> actor = TensorDictModule(actor, ["observation"], ["loc", "scale"])
+        >>> actor = ProbabilisticActor(actor, ["loc", "scale"], distribution_class=TanhNormal)
+        >>> encoder = TensorDictModule(torch.nn.Linear(3, 8), ["observation"], ["features"])
+        >>> critics = MLP(in_features=8 + 2, out_features=2, num_cells=[16])
+        >>> critics = TensorDictModule(critics, ["features", "action"], ["state_action_value"])
+        >>> loss = SACfDLoss(actor, encoder, critics)
+        >>> batch = {"observation": torch.rand(16, 3), "action": torch.rand(16, 2)}
+        >>> ends = torch.zeros(16, 1, dtype=torch.bool)
+        >>> batch["next"] = {"observation": torch.rand(16, 3), "reward": torch.rand(16, 1)}
+        >>> batch["next"] |= {"done": ends, "terminated": ends}
+        >>> batch["is_demonstration"] = torch.arange(16)[:, None] < 8
+        >>> losses = loss(TensorDict(batch, [16]))
+        >>> (losses["loss_actor"] + losses["loss_qvalue"] + losses["loss_alpha"]).backward()
+        >>> loss.target_entropy
+        tensor(-2.)
     """
 
     @dataclass

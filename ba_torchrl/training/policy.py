@@ -234,6 +234,14 @@ def load_policy(
     Raises:
         ConfigError: there is no such policy, its files are damaged, or it names plugins that are
             neither imported nor installed.
+
+    Examples:
+        >>> from ba_torchrl import load_policy
+        >>> policy = load_policy("close_loop/block_reaching")
+        >>> env = policy.make_env(seed=0)
+        >>> bool(env.rollout(100, policy)["next", "success"].any())
+        True
+        >>> env.close()
     """
     check_choice("which", which, Which)
     changes = {**_OF_TRAINING, "device": str(device), **changes}

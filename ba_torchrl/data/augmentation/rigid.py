@@ -106,6 +106,23 @@ class RigidAugmentation(SeededTransform):
         ValueError: the probability is outside [0, 1], the order is not positive, an image cannot be
             transformed, the transforms rotate and the action has no yaw, or they reflect and the
             action has tilts.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ba_torchrl.core.actions import OpenLoopActions
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import RigidAugmentation
+        >>> workspace_m = ((0.25, 0.65), (-0.2, 0.2), (0.01, 0.25))
+        >>> images = {"heightmap": ImageSpec(channels=1, size=64, high=0.25)}
+        >>> actions = OpenLoopActions("pxyr", workspace_m)
+        >>> transform = RigidAugmentation("se2", actions, images, seed=0)
+        >>> batch = {"heightmap": torch.rand(8, 1, 64, 64), "action": torch.zeros(8, 4)}
+        >>> batch["action"][:, 1] = 0.45  # the workspace's centre
+        >>> batch["next"] = {"heightmap": torch.rand(8, 1, 64, 64)}
+        >>> moved = transform(TensorDict(batch, [8]))  # or replay.append_transform(transform)
+        >>> moved["heightmap"].shape, moved["action"].shape
+        (torch.Size([8, 1, 64, 64]), torch.Size([8, 4]))
     """
 
     def __init__(

@@ -183,6 +183,21 @@ class SO2Augmentation(SeededTransform):
     Raises:
         ValueError: the probability is outside [0, 1], x or y is missing, the images are those of an
             open-loop task, or an image cannot be rotated.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import SO2Augmentation
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> rotation = SO2Augmentation(images, "pxyzr", seed=0, probability=1.0)
+        >>> def observed():
+        ...     return {"depth": torch.rand(8, 1, 64, 64), "holding": torch.zeros(8, 1) > 0}
+        >>> batch = {**observed(), "action": torch.rand(8, 5), "next": observed()}
+        >>> batch = TensorDict(batch, [8])
+        >>> rotated = rotation(batch)  # or replay.append_transform(rotation)
+        >>> torch.equal(rotated["action"][:, [0, 3, 4]], batch["action"][:, [0, 3, 4]])
+        True
     """
 
     def __init__(
@@ -245,6 +260,23 @@ class StoredCopies(Transform):
     Args:
         transform: augmentation of a batch of transitions.
         copies: number of copies of each transition.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import SO2Augmentation, StoredCopies
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> copies = StoredCopies(SO2Augmentation(images, "pxyzr", seed=0), copies=4)
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), transform=copies)
+        >>> def observed():
+        ...     return {"depth": torch.rand(8, 1, 64, 64), "holding": torch.zeros(8, 1) > 0}
+        >>> batch = {**observed(), "action": torch.rand(8, 5), "next": observed()}
+        >>> batch = TensorDict(batch, [8])
+        >>> index = replay.extend(batch)
+        >>> len(replay)
+        40
     """
 
     def __init__(self, transform: Transform, copies: int) -> None:

@@ -50,6 +50,16 @@ class CenterCrop(Transform):
 
     Raises:
         ConfigError: at the first image that is smaller than its part.
+
+    Examples:
+        >>> from torchrl.envs import TransformedEnv
+        >>> from ba_torchrl import make
+        >>> from ba_torchrl.data import CenterCrop
+        >>> env = make("close_loop/block_reaching", obs_size=76)
+        >>> env = TransformedEnv(env, CenterCrop(64, in_keys=["depth"]))
+        >>> env.reset()["depth"].shape
+        torch.Size([1, 64, 64])
+        >>> env.close()
     """
 
     def __init__(
@@ -123,6 +133,21 @@ class RandomViews(SeededTransform):
 
     Raises:
         ValueError: a number of views is not positive.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import RandomViews
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> views = RandomViews(images, seed=0, padding=4, views=2)
+        >>> def observed():
+        ...     return {"depth": torch.rand(8, 1, 64, 64), "holding": torch.zeros(8, 1) > 0}
+        >>> batch = {**observed(), "action": torch.rand(8, 5), "next": observed()}
+        >>> batch = TensorDict(batch, [8])
+        >>> seen = views(batch)  # or replay.append_transform(views)
+        >>> seen["depth"].shape, seen["next", "depth"].shape
+        (torch.Size([8, 2, 1, 64, 64]), torch.Size([8, 1, 64, 64]))
     """
 
     def __init__(

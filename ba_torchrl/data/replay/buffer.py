@@ -39,6 +39,19 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
 
     Raises:
         ConfigError: the storage is not a `FrameStorage`.
+
+    Examples:
+        >>> import torch
+        >>> from torchrl.data.replay_buffers.samplers import RandomSampler
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import FrameReplayBuffer, FrameStorage, make_codecs
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> replay = FrameReplayBuffer(
+        ...     storage=FrameStorage(1000, make_codecs(images)), sampler=RandomSampler(),
+        ...     batch_size=32, generator=torch.Generator().manual_seed(0),
+        ... )
+        >>> len(replay)
+        0
     """
 
     def __init__(

@@ -41,6 +41,15 @@ def make_codecs(images: Mapping[str, ImageSpec]) -> dict[str, ImageCodec]:
 
     Raises:
         ValueError: an image has values that its storage cannot represent.
+
+    Examples:
+        >>> import torch
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import make_codecs
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> codec = make_codecs(images)["depth"]
+        >>> codec.encode(torch.tensor([0.1, 0.3]))
+        tensor([ 64, 191], dtype=torch.uint8)
     """
     return {key: _make_codec(key, image) for key, image in images.items()}
 
@@ -80,6 +89,19 @@ class ImageCodecs(Transform):
             them itself.
         device: to which images are copied before they are decoded; None to leave them where they
             are.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import ImageCodecs
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> codecs = ImageCodecs(images, in_keys_inv=["depth"])
+        >>> replay = TensorDictReplayBuffer(storage=LazyTensorStorage(100), transform=codecs)
+        >>> index = replay.extend(TensorDict({"depth": torch.full((8, 1, 64, 64), 0.3)}, [8]))
+        >>> replay.storage[:]["depth"].dtype, replay.sample(4)["depth"].dtype
+        (torch.uint8, torch.float32)
     """
 
     def __init__(

@@ -43,6 +43,22 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
 
     Raises:
         ValueError: an exponent or the bonus is negative, or ``eps`` is not positive.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from ba_torchrl.data import ExpertPrioritizedSampler
+        >>> storage, sampler = LazyTensorStorage(100), ExpertPrioritizedSampler(100, beta=0.4)
+        >>> replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=8)
+        >>> steps = {"observation": torch.rand(20, 3), "is_demonstration": torch.arange(20) < 5}
+        >>> steps = TensorDict(steps, [20])
+        >>> replay.extend(steps).shape
+        torch.Size([20])
+        >>> batch = replay.sample()
+        >>> batch["priority_weight"].shape
+        torch.Size([8])
+        >>> replay.update_tensordict_priority(batch.set("td_error", torch.rand(8)))
     """
 
     def __init__(

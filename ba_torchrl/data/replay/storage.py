@@ -175,6 +175,21 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
 
     Raises:
         ValueError: ``codecs`` is empty.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import TensorDictReplayBuffer
+        >>> from ba_torchrl.core.images import ImageSpec
+        >>> from ba_torchrl.data import FrameStorage, make_codecs
+        >>> images = {"depth": ImageSpec(channels=1, size=64, high=0.4, storage="uint8")}
+        >>> storage = FrameStorage(1000, make_codecs(images))
+        >>> replay = TensorDictReplayBuffer(storage=storage, batch_size=16)
+        >>> frames = torch.rand(9, 1, 64, 64) * 0.4
+        >>> steps = {"depth": frames[:8], "next": {"depth": frames[1:]}}
+        >>> index = replay.extend(TensorDict(steps, [8]))
+        >>> storage.frame_count, replay.sample()["next", "depth"].shape
+        (9, torch.Size([16, 1, 64, 64]))
     """
 
     def __init__(

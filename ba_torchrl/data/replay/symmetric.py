@@ -27,6 +27,19 @@ class SymmetricSampler(OneProcess, StateFolder, Sampler):
 
     Args:
         seed: of the draws; each half has a separate generator, and that of the buffer is not used.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from ba_torchrl.data import SymmetricSampler
+        >>> storage, sampler = LazyTensorStorage(100), SymmetricSampler(seed=0)
+        >>> replay = TensorDictReplayBuffer(storage=storage, sampler=sampler, batch_size=8)
+        >>> steps = {"observation": torch.rand(20, 3), "is_demonstration": torch.arange(20) < 5}
+        >>> steps = TensorDict(steps, [20])
+        >>> index = replay.extend(steps)
+        >>> int(replay.sample()["is_demonstration"].sum())
+        4
     """
 
     def __init__(self, seed: int) -> None:

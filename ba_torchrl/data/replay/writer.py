@@ -19,6 +19,19 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
     A new transition overwrites the oldest one whose ``is_demonstration`` flag is not set. Data
     without this entry are written as by TorchRL's writer. Of equally ranked transitions, TorchRL's
     `TensorDictMaxValueWriter` keeps the oldest.
+
+    Examples:
+        >>> import torch
+        >>> from tensordict import TensorDict
+        >>> from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+        >>> from ba_torchrl.data import ExpertKeepingWriter
+        >>> storage, writer = LazyTensorStorage(8), ExpertKeepingWriter()
+        >>> replay = TensorDictReplayBuffer(storage=storage, writer=writer)
+        >>> steps = {"observation": torch.rand(20, 3), "is_demonstration": torch.arange(20) < 5}
+        >>> steps = TensorDict(steps, [20])
+        >>> first, last = replay.extend(steps[:8]), replay.extend(steps[8:])
+        >>> int(replay[:]["is_demonstration"].sum())
+        5
     """
 
     def register_storage(self, storage: Storage) -> None:
