@@ -164,8 +164,9 @@ class LevelDQNLoss(TransitionLoss):
     input.
 
     Args:
-        value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
-            single level, see `SingleLevelValues`.
+        value_network: computes the values of the levels, see `LevelValues`, such as
+            `ba_torchrl.modules.SpatialValues`. TorchRL's `QValueActor` is used as a single level,
+            see `SingleLevelValues`.
         demonstrations: "dqfd" `large_margin` and "adet" `cross_entropy`, means over the
             demonstrations in the batch; "sdqfd" `strict_large_margin`, a mean over the batch, with
             zero for other samples; or "none" for plain DQN, which needs no demonstration flag.
@@ -175,7 +176,9 @@ class LevelDQNLoss(TransitionLoss):
         later_beta: inverse temperature of "adet" at later levels.
         double_dqn: whether the online network chooses the actions whose values the target network
             computes.
-        options: of `TransitionLoss`; the formulas above are for the reduction "mean".
+        options: ``reduction``, ``weighted_terms``, ``weight_norm`` and ``use_prioritized_weights``
+            of `ba_torchrl.objectives.base.TransitionLoss`; the formulas above are for the reduction
+            "mean".
 
     Examples:
         >>> import torch

@@ -64,7 +64,7 @@ class BehaviourCloningLoss(_ImitationLoss):
 
     Args:
         actor_network: policy; from the observation to a distribution with ``rsample``.
-        distance: of actions.
+        distance: of actions, "mse" or "kl", see `ba_torchrl.objectives.distance.action_distance`.
         entropy_weight: weight w of the negative entropy of the policy.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
 
@@ -140,8 +140,9 @@ class LevelCrossEntropyLoss(_ImitationLoss):
     the expert's choices at the levels before, averaged over the batch and summed over the levels.
 
     Args:
-        value_network: computes the values of the levels. TorchRL's `QValueActor` is used as a
-            single level, see `SingleLevelValues`.
+        value_network: computes the values of the levels, see
+            `ba_torchrl.objectives.dqn.LevelValues`. TorchRL's `QValueActor` is used as a single
+            level, see `SingleLevelValues`.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
 
     Examples:

@@ -67,12 +67,15 @@ class SACfDLoss(TransitionLoss):
         entropy_backup: whether y has the entropy term; without it, y is the return alone.
         demonstration_weight: weight of the behaviour term; 0 for plain SAC, which needs no flag of
             demonstrations in the batch.
-        demonstration_distance: of the behaviour term.
+        demonstration_distance: of the behaviour term, "mse" or "kl", see
+            `ba_torchrl.objectives.distance.action_distance`.
         views: number of views of the observation. If there are several, the entries of the
             observation have a dimension of views after the batch.
         target_views: number of views of the next observation, likewise.
         contrastive: of `contrastive_loss`: from anchors and positives [B, F] to losses [B].
-        options: of `TransitionLoss`; the formulas above are for the reduction "mean".
+        options: ``reduction``, ``weighted_terms``, ``weight_norm`` and ``use_prioritized_weights``
+            of `ba_torchrl.objectives.base.TransitionLoss`; the formulas above are for the reduction
+            "mean".
 
     Raises:
         ValueError: ``alpha_init`` is not positive, ``demonstration_distance`` is unknown, or the
