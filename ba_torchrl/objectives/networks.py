@@ -58,7 +58,7 @@ class EvalModeTargetsLoss(LossModule):
                 kept |= _not_reset(part)
                 _reset_parameters(part)
             elif not name.startswith("target_"):
-                network = self.__dict__[name.removesuffix("_params")]
+                network = self.__dict__[name.rpartition("_")[0]]
                 kept |= _not_reset(network)
                 for params in part.data.unbind(0) if part.ndim else (part.data,):
                     with params.to_module(network, preserve_module_state=False):
