@@ -82,7 +82,9 @@ class ChunkHead(nn.Module):
 
 def encoded_time(time: Tensor) -> Tensor:
     """Return sines and cosines [..., 16] of times [...] in [0, 1], with frequencies up to 50."""
-    steps = torch.linspace(0, math.log(_FASTEST), _FREQUENCIES, device=time.device)
+    steps = torch.linspace(
+        0, math.log(_FASTEST), _FREQUENCIES, dtype=time.dtype, device=time.device
+    )
     angles = time[..., None] * steps.exp()
     return torch.cat([angles.sin(), angles.cos()], dim=-1)
 
@@ -151,7 +153,8 @@ class ChunkPolicy(TensorDictModuleBase):
         horizon = flow.head.horizon
         if not 1 <= executed <= horizon:
             raise ValueError(f"executed must be between 1 and {horizon}, got {executed}")
-        noise = torch.randn(_NOISES, horizon, action_size, generator=seeded_generator(0))
+        shape = (_NOISES, horizon, action_size)
+        noise = torch.randn(shape, generator=seeded_generator(0), dtype=torch.float32, device="cpu")
         self.register_buffer("noise", noise, persistent=False)
         self.flow = TensorDictModule(flow, [*in_keys, keys.NOISE], [keys.ACTION_CHUNK])
         self.in_keys = [*in_keys, keys.STEP_COUNT]
@@ -180,7 +183,6 @@ class ChunkPolicy(TensorDictModuleBase):
     def _noise(self, count: Tensor) -> Tensor:
         if exploration_type() is not ExplorationType.RANDOM:
             return self.noise[count % len(self.noise)]
-        drawn = torch.randn(
-            *count.shape, *self.noise.shape[1:], generator=self.generator, device="cpu"
-        )
+        shape = (*count.shape, *self.noise.shape[1:])
+        drawn = torch.randn(shape, generator=self.generator, dtype=torch.float32, device="cpu")
         return drawn.to(self.noise)

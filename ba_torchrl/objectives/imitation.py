@@ -25,7 +25,7 @@ from ba_torchrl.objectives.networks import (
 )
 
 
-class _ImitationLoss(EvalModeTargetsLoss):
+class ImitationLoss(EvalModeTargetsLoss):
     """A loss on observations and the actions to imitate, reduced over the samples of a batch that
     no mask excludes (TorchRL's ``loss_mask_key``)."""
 
@@ -51,7 +51,7 @@ class _ImitationLoss(EvalModeTargetsLoss):
         self.in_keys = [*self._observation, self.tensor_keys.action]
 
 
-class BehaviourCloningLoss(_ImitationLoss):
+class BehaviourCloningLoss(ImitationLoss):
     """Behaviour cloning of a stochastic policy: the distance of an action drawn from it.
 
     The mean over the batch of the `action_distance` of a ~ pi, drawn with gradient, from the
@@ -133,7 +133,7 @@ class BehaviourCloningLoss(_ImitationLoss):
         return self._reduce_loss(losses, tensordict)
 
 
-class LevelCrossEntropyLoss(_ImitationLoss):
+class LevelCrossEntropyLoss(ImitationLoss):
     """Behaviour cloning of a policy that chooses an action level by level.
 
     The cross-entropy of the softmax of each level's values with the expert's choice, conditioned on

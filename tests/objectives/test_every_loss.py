@@ -12,9 +12,11 @@ from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
 from ba_torchrl.core import keys
+from ba_torchrl.modules.chunks import ChunkFlow, ChunkHead
 from ba_torchrl.modules.spatial.policy import SpatialValues
 from ba_torchrl.objectives import (
     BehaviourCloningLoss,
+    FlowMatchingLoss,
     LevelCrossEntropyLoss,
     LevelDQNLoss,
     RLPDLoss,
@@ -92,6 +94,20 @@ def levels(**options):
     return LevelDQNLoss(SpatialValues(Tables(), ACTIONS), **options)
 
 
+def flow(**options):
+    head = ChunkHead(4, torch.eye(2)[None], torch.zeros(1, 0, 0), horizon=4, hidden=8)
+    network = ChunkFlow(LinearEncoder(), head)
+    network = TensorDictModule(network, [*OBSERVATION, keys.NOISE], [keys.ACTION_CHUNK])
+    return FlowMatchingLoss(network, **options)
+
+
+def chunks():
+    data = continuous()
+    chunk = torch.rand(20, 4, 2, generator=torch.Generator().manual_seed(2))
+    is_valid = torch.arange(20)[:, None] % 5 + torch.arange(4) < 5
+    return data.set(keys.TARGET_CHUNK, chunk).set(keys.TARGET_CHUNK_MASK, is_valid)
+
+
 LOSSES = {
     "sacfd": (lambda **options: sac(SACfDLoss, 2, **options), continuous),
     "rlpd": (lambda **options: sac(RLPDLoss, 3, subset=3, **options), continuous),
@@ -117,6 +133,7 @@ LOSSES = {
         lambda **options: LevelCrossEntropyLoss(actor("categorical"), **options),
         lambda: discrete_batch(action_space=None),
     ),
+    "flow": (flow, chunks),
     "iql": (iql, continuous),
 }
 OURS = [name for name in LOSSES if name != "iql"]
@@ -173,7 +190,7 @@ def test_in_keys_are_what_a_loss_needs_and_out_keys_what_it_returns(name):
     names = {"_".join([key] if isinstance(key, str) else key): key for key in loss.in_keys}
     torch.manual_seed(7)
     by_name = loss(**{name: data[key] for name, key in names.items()})
-    assert len(by_name) == len(loss.out_keys)
+    by_name = by_name if isinstance(by_name, tuple) else (by_name,)
     for key, value in zip(loss.out_keys, by_name, strict=True):
         torch.testing.assert_close(value, out[key])
     chosen = loss.out_keys[0]
@@ -255,7 +272,8 @@ def test_states_copies_and_pickles_compute_the_same(name):
 @every_loss
 def test_parameters_are_reset(name, recwarn):
     loss = make(name)
-    before = {key: value.clone() for key, value in loss.state_dict().items() if "params" in key}
+    drawn = {key: "params" in key and "frames" not in key for key in loss.state_dict()}
+    before = {key: value.clone() for key, value in loss.state_dict().items() if drawn[key]}
     with torch.no_grad():
         for value in (*loss.parameters(), *loss.buffers()):
             value.add_(1000)
