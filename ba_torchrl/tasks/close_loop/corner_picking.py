@@ -8,9 +8,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ba_torchrl.core.actions import GripperCommand
+from ba_torchrl.core.actions import GripperCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body, vertical_extent
-from ba_torchrl.sim.geometry import PlanarFrame
+from ba_torchrl.sim.geometry import PlanarFrame, Vector
 from ba_torchrl.sim.meshes import box_mesh, transform_mesh
 from ba_torchrl.sim.shapes import Box, Color, Solid
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
@@ -19,6 +19,7 @@ from ba_torchrl.tasks.manipulation.clearance import finger_extent_m
 from ba_torchrl.tasks.manipulation.primitives import (
     CLOSED,
     IS_CLOSED,
+    IS_OPEN,
     OPEN,
     closing,
     grasped_body,
@@ -38,31 +39,40 @@ each other, and the friction of the base is too low to stop the block."""
 
 GRASP_CLEARANCE_M = 2e-3
 """Least clearance of the open fingers for a grasp."""
+DRAG_CLEARANCE_M = 10e-3
+"""Clearance, at both grasp yaws, at which a drag ends. Open fingers need less, so that no second
+drag follows."""
+DRAG_GOAL_M = 0.015
+"""Target of a drag along both axes of the corner's frame."""
 PASSING_CLEARANCE_M = 0.012
 """Gap between the closed fingertips and the block or the walls that they pass over."""
-DRAG_CLEARANCE_M = 15e-3
-"""Clearance at which a drag ends, larger than for a grasp so that no second drag follows."""
-DRAG_GOAL_M = 0.0
-"""Target of a drag along both axes of the corner's frame."""
-DRAG_HEIGHT_M = 3e-3
-"""Largest height above the block of closed fingertips that press on it and drag it."""
-PRESS_M = 4e-3
-"""Commanded depth of the fingertips below the top of the block during a drag."""
-APPROACH_GAP_M = 5e-4
-"""Gap between the fingertips and the block before the drag. From less than a millimetre the
-fingers move slowly and do not hit the block."""
-APPROACH_TOLERANCE_M = 3e-3
-"""Tolerance of the height at the end of the approach."""
+PASSING_TOLERANCE_M = 8e-3
+"""Part of that gap that may be missing during the motion."""
+PRESS_M = 8e-3
+"""Commanded depth of the fingertips below the top of the block. The block stops them, so that they
+are on it whatever the error of the command is, down to a heightmap's step of 1.5 mm."""
+DRAG_DEPTH_M = 5e-3
+"""The same during a drag. Fingers that press harder yield, and slide over the block."""
+ON_BLOCK_M = 6e-3
+"""Largest height above the block of closed fingertips that drag it. Fingers that have pressed are
+at zero, those that have not are higher."""
+DRAG_RAMP_M = 4e-3
+"""Difference of height over which the displacement of a drag increases from zero."""
 PRESS_TOLERANCE_M = 5e-3
-"""Tolerance of the horizontal position of the press."""
-WALL_GAP_M = 3e-3
-"""Gap between the closed hand and a wall that allows a descent beside it. At a press on a small
-block the gap is smaller, and that of the press is allowed, less `WALL_TOLERANCE_M`."""
-WALL_TOLERANCE_M = 1.5e-3
-"""Largest displacement of a low hand towards a wall from the position of such a press."""
+"""Horizontal distance from the press within which the fingers press; from farther they descend to a
+gap that increases with the distance."""
+WALL_TOLERANCE_M = 3e-3
+"""Largest overlap of the closed hand with a wall on its way to the press. The hand slides along a
+wall that it touches."""
+WAY_SAMPLES = 9
+"""Poses of that way that are compared with the walls."""
 HAND_MARGIN_M = 0.01
 """Gap wanted between the closed hand and a wall. With more, the press would be farther from the
 centre of the block and tilt it."""
+BETWEEN_M = 0.02
+"""Largest horizontal offset of low open fingers that have the block between them."""
+DEPTH_BETWEEN_M = 5e-3
+"""Least depth of such fingertips below the top of the block."""
 
 
 @TASKS.register("close_loop/corner_picking")
@@ -74,7 +84,7 @@ class CornerPicking(CloseLoopTask):
     drag it out. The episode ends early when the block leaves the workspace. Paper, appendix A.2.
     """
 
-    expert_version = 1
+    expert_version = 2
 
     base_m: ClassVar[float] = 0.2
     """Edge of the base, metres."""
@@ -159,26 +169,35 @@ class CornerPicking(CloseLoopTask):
         return staged(nearness(math.hypot(aside_m, max(above_m, 0.0))), drag, 0.0, 0.0, 0.0)
 
     def expert_command(self) -> GripperCommand:
-        """Drag the block out of the corner until a grasp has clearance, then grasp and lift it."""
+        """Drag the block out of the corner until a grasp has clearance, then grasp and lift it.
+
+        Closed fingers drag until grasps at both yaws have clearance; open ones grasp.
+        """
         robot, block, limits = self.robot, self.block, self.action_limits
         if grasped_body(robot) is block:
             return lift(limits.step_m)
+        is_closed = robot.opening() < IS_CLOSED
         yaw = robot.tool_pose()[1]
-        is_on_block = self._is_on_block()
-        yaws = [
-            nearest_equivalent_yaw(yaw, block.yaw_rad + k * math.pi / 2, limits, math.pi)
-            for k in (0, 1)
-        ]
-        needed = DRAG_CLEARANCE_M if is_on_block else GRASP_CLEARANCE_M
-        yaws = [wanted for wanted in yaws if self.clearance_m(wanted) >= needed]
-        if not yaws:
-            return self._drag() if is_on_block else self._press()
-        if is_on_block:  # steeply up and without rotation, so that the block does not move along
-            x, y, z = block.position
-            above_z = z + self.block_m / 2 + self._tips_below_m + PASSING_CLEARANCE_M
-            return move_toward(robot, (x, y, above_z), yaw, OPEN)
+        nearest = nearest_equivalent_yaw(yaw, block.yaw_rad, limits, math.pi / 2)
+        clearance = self.clearance_m(nearest)
+        needed = GRASP_CLEARANCE_M
+        if is_closed:
+            needed = DRAG_CLEARANCE_M
+            if limits.turn_rad:
+                clearance = min(clearance, self.clearance_m(nearest + math.pi / 2))
+        if clearance < needed:
+            return self._drag() if self._is_on_block() else self._press()
+        x, y, z = block.position
+        top = vertical_extent(block)[1]
+        if is_closed and self._is_over_block() and self._height_m > -self.block_m / 4:
+            # steeply up and without rotation, so that the block does not move along
+            above_z = top + self._tips_below_m + PASSING_CLEARANCE_M
+            return move_toward(robot, (x, y, max(above_z, robot.tool_pose()[0][2])), yaw, OPEN)
+        if self._is_around_block():
+            is_low = robot.tool_pose()[0][2] - z <= limits.step_m
+            return move_toward(robot, (x, y, z), nearest, CLOSED if is_low else OPEN)
         ceiling = self.settings.workspace.z[1]
-        return pick_up(robot, block, limits, yaws_rad=yaws, ceiling_m=ceiling)
+        return pick_up(robot, block, limits, yaws_rad=[nearest], ceiling_m=ceiling)
 
     def clearance_m(self, yaw_rad: float) -> float:
         """Return the clearance between the walls and open fingers around the block, metres."""
@@ -197,13 +216,26 @@ class CornerPicking(CloseLoopTask):
 
     def _is_on_block(self) -> bool:
         """Whether closed fingertips are on the block, or just above it."""
-        if self.robot.opening() >= IS_CLOSED:
-            return False
+        is_closed = self.robot.opening() < IS_CLOSED
+        is_near = -self.block_m / 4 < self._height_m < ON_BLOCK_M
+        return is_closed and is_near and self._is_over_block()
+
+    def _is_over_block(self) -> bool:
+        """Whether the tool is over the block, or beside it within its outline."""
+        return self._offset_m() <= self.block_m / 2
+
+    def _offset_m(self) -> float:
+        """Return the horizontal offset of the tool from the block, in the frame of the block."""
         frame = PlanarFrame(*self.block.position[:2], self.block.yaw_rad)
-        offset = frame.to_local(*self.robot.tool_pose()[0][:2])
-        if max(map(abs, offset)) > self.block_m / 2:
-            return False
-        return -self.block_m / 4 < self._height_m < DRAG_HEIGHT_M
+        return max(map(abs, frame.to_local(*self.robot.tool_pose()[0][:2])))
+
+    def _is_around_block(self) -> bool:
+        """Whether open fingers are low with the block between them."""
+        robot = self.robot
+        top = vertical_extent(self.block)[1]
+        tips_z = robot.tool_pose()[0][2] + robot.gripper.tip_height_m(robot.gripper.half_gap_m)
+        is_low = tips_z < top - DEPTH_BETWEEN_M
+        return robot.opening() >= IS_OPEN and is_low and self._offset_m() <= BETWEEN_M
 
     @property
     def _height_m(self) -> float:
@@ -217,7 +249,7 @@ class CornerPicking(CloseLoopTask):
         return -self.robot.gripper.tip_height_m(0.0)
 
     def _press(self) -> GripperCommand:
-        """Move above the block with closed fingers, and descend to it.
+        """Move above the block with closed fingers, descend and press.
 
         The hand descends while it moves and turns, wherever it is clear of the walls on a straight
         way to the press.
@@ -238,34 +270,45 @@ class CornerPicking(CloseLoopTask):
             px += offset
         else:
             py += offset
-        tool_x, tool_y = self.corner.to_local(x, y)
-        gap_now, press_gap = (
-            self._wall_gap_m(*xy, hand_half, wanted - self.corner.yaw_rad)
-            for *xy, wanted in ((tool_x, tool_y, yaw), (px, py, target_yaw))
-        )
-        is_clear = gap_now >= min(WALL_GAP_M, press_gap - WALL_TOLERANCE_M)
-        low_z = top + self._tips_below_m + APPROACH_GAP_M
-        target = self.corner.to_world(px, py)
-        distance = max(abs(tool_x - px), abs(tool_y - py))
-        if robot.opening() >= IS_CLOSED or not is_clear:
-            low_z = wall_top + self._tips_below_m + PASSING_CLEARANCE_M
-            if z < low_z - 1e-3:
-                return lift(low_z - z, closing(robot))
-        elif z < low_z - APPROACH_TOLERANCE_M / 2 and distance > PRESS_TOLERANCE_M:
-            return lift(low_z + APPROACH_TOLERANCE_M - z)  # a low hand would push the block back
-        return move_toward(robot, (*target, low_z), target_yaw, closing(robot))
+        px, py = self.corner.to_world(px, py)
+        distance = max(abs(x - px), abs(y - py))
+        gap = min(max(distance - PRESS_TOLERANCE_M, 0.0), PASSING_CLEARANCE_M + PRESS_M)
+        target = (px, py, top + self._tips_below_m - PRESS_M + gap)
+        if robot.opening() < IS_CLOSED and self._is_clear(target, target_yaw):
+            if self._height_m < 0 and not self._is_over_block():
+                # a low hand would push the block back
+                return lift(PASSING_CLEARANCE_M - self._height_m)
+            return move_toward(robot, target, target_yaw, CLOSED)
+        over_z = wall_top + self._tips_below_m + PASSING_CLEARANCE_M
+        if z < over_z - PASSING_TOLERANCE_M:
+            return lift(over_z - z, closing(robot))
+        return move_toward(robot, (px, py, over_z), target_yaw, closing(robot))
+
+    def _is_clear(self, target: Vector, target_yaw_rad: float) -> bool:
+        """Whether the closed hand is clear of the walls on a straight way to a pose."""
+        start, yaw = self.robot.tool_pose()
+        wall_top = vertical_extent(self.walls)[1]
+        turn = wrap_angle(target_yaw_rad - yaw)
+        for share in np.linspace(0.0, 1.0, WAY_SAMPLES).tolist():
+            x, y, z = (s + share * (t - s) for s, t in zip(start, target, strict=True))
+            reach = self.robot.gripper.closed_reach_m(wall_top - z)
+            angle = yaw + share * turn - self.corner.yaw_rad
+            if reach and self._wall_gap_m(x, y, reach, angle) < -WALL_TOLERANCE_M:
+                return False
+        return True
 
     def _wall_gap_m(self, x: float, y: float, hand_half_m: float, turn_rad: float) -> float:
         """Return the gap between the closed hand and the nearer wall.
 
         Args:
-            x: position of the tool in the corner's frame, as ``y``.
+            x: position of the tool, as ``y``.
             hand_half_m: reach of the closed hand along the direction in which it opens.
             turn_rad: yaw of the tool in the corner's frame.
         """
         cos, sin = abs(math.cos(turn_rad)), abs(math.sin(turn_rad))
         half_width = self.robot.gripper.half_width_m
         inner = (self.wall_m - self.base_m) / 2
+        x, y = self.corner.to_local(x, y)
         along = x - hand_half_m * cos - half_width * sin
         across = y - hand_half_m * sin - half_width * cos
         return min(along, across) - inner
@@ -280,10 +323,9 @@ class CornerPicking(CloseLoopTask):
         )
         dx, dy = (g - b for g, b in zip(goal, self.block.position, strict=False))
         height = self._height_m
-        step_m = self.action_limits.step_m * min((DRAG_HEIGHT_M - height) / DRAG_HEIGHT_M, 1.0)
+        step_m = self.action_limits.step_m * min((ON_BLOCK_M - height) / DRAG_RAMP_M, 1.0)
         share = min(1.0, step_m / max(abs(dx), abs(dy), 1e-6))
-        dz = min(-PRESS_M - height, 0.0)
-        return GripperCommand(CLOSED, share * dx, share * dy, dz, 0.0)
+        return GripperCommand(CLOSED, share * dx, share * dy, -DRAG_DEPTH_M - height, 0.0)
 
     @property
     def objects(self) -> Sequence[Body]:
