@@ -289,10 +289,10 @@ class CornerPicking(CloseLoopTask):
         start, yaw = self.robot.tool_pose()
         wall_top = vertical_extent(self.walls)[1]
         turn = wrap_angle(target_yaw_rad - yaw)
-        for share in np.linspace(0.0, 1.0, WAY_SAMPLES).tolist():
-            x, y, z = (s + share * (t - s) for s, t in zip(start, target, strict=True))
+        for part in np.linspace(0.0, 1.0, WAY_SAMPLES).tolist():
+            x, y, z = (s + part * (t - s) for s, t in zip(start, target, strict=True))
             reach = self.robot.gripper.closed_reach_m(wall_top - z)
-            angle = yaw + share * turn - self.corner.yaw_rad
+            angle = yaw + part * turn - self.corner.yaw_rad
             if reach and self._wall_gap_m(x, y, reach, angle) < -WALL_TOLERANCE_M:
                 return False
         return True
