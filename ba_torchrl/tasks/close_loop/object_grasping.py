@@ -34,6 +34,10 @@ RISK_ALLOWED_WITHOUT_YAW = 1.0
 ones, it pushes an object first."""
 SLIP = 5
 """Column of the slip in the planner's grasps."""
+TURN_OFFSET_M = 0.02
+"""Largest horizontal offset, along each axis, of a gripper that turns to a grasp as fast as it can;
+from twice as far it does not turn. The image is centred on the gripper, so a policy sees the object
+whose orientation matters in its centre."""
 GRASP_OFFSET_M = 0.02
 """Largest horizontal offset, along each axis, of a gripper that descends straight to a grasp and
 closes. With 4 mm, a policy with errors of a centimetre stays above the object: its next action is
@@ -168,6 +172,7 @@ class ObjectGrasping(ClutterTask, CloseLoopTask):
             return lift(next_z - z, OPEN)
         share = min(max((z - hover_z + HOVER_TOLERANCE_M) / HOVER_RAMP_M, 0.0), 1.0)
         target = (x + share * (gx - x), y + share * (gy - y), next_z)
+        share *= min(max(2 - offset / TURN_OFFSET_M, 0.0), 1.0)
         return move_toward(robot, target, yaw + share * turn, OPEN)
 
     def _is_between(self, tool: YawPose, heights: np.ndarray) -> bool:
