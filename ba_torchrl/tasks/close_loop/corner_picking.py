@@ -51,8 +51,9 @@ PASSING_TOLERANCE_M = 8e-3
 PRESS_M = 8e-3
 """Commanded depth of the fingertips below the top of the block. The block stops them, so that they
 are on it whatever the error of the command is, down to a heightmap's step of 1.5 mm."""
-DRAG_DEPTH_M = 5e-3
-"""The same during a drag. Fingers that press harder yield, and slide over the block."""
+DRAG_DEPTH = 0.1
+"""The same during a drag, as a share of the block's width. Fingers that press harder yield, and
+slide over the block."""
 ON_BLOCK_M = 6e-3
 """Largest height above the block of closed fingertips that drag it. Fingers that have pressed are
 at zero, those that have not are higher."""
@@ -285,17 +286,20 @@ class CornerPicking(CloseLoopTask):
         return move_toward(robot, (px, py, over_z), target_yaw, closing(robot))
 
     def _is_clear(self, target: Vector, target_yaw_rad: float) -> bool:
-        """Whether the closed hand is clear of the walls on a straight way to a pose."""
+        """Whether the closed hand is clear of the walls on a straight way to a pose.
+
+        At a press on a small block it touches them; the way to it may, too.
+        """
         start, yaw = self.robot.tool_pose()
         wall_top = vertical_extent(self.walls)[1]
         turn = wrap_angle(target_yaw_rad - yaw)
+        gaps = []
         for part in np.linspace(0.0, 1.0, WAY_SAMPLES).tolist():
             x, y, z = (s + part * (t - s) for s, t in zip(start, target, strict=True))
             reach = self.robot.gripper.closed_reach_m(wall_top - z)
             angle = yaw + part * turn - self.corner.yaw_rad
-            if reach and self._wall_gap_m(x, y, reach, angle) < -WALL_TOLERANCE_M:
-                return False
-        return True
+            gaps.append(self._wall_gap_m(x, y, reach, angle) if reach else math.inf)
+        return min(gaps) >= min(gaps[-1], 0.0) - WALL_TOLERANCE_M
 
     def _wall_gap_m(self, x: float, y: float, hand_half_m: float, turn_rad: float) -> float:
         """Return the gap between the closed hand and the nearer wall.
@@ -325,7 +329,9 @@ class CornerPicking(CloseLoopTask):
         height = self._height_m
         step_m = self.action_limits.step_m * min((ON_BLOCK_M - height) / DRAG_RAMP_M, 1.0)
         share = min(1.0, step_m / max(abs(dx), abs(dy), 1e-6))
-        return GripperCommand(CLOSED, share * dx, share * dy, -DRAG_DEPTH_M - height, 0.0)
+        return GripperCommand(
+            CLOSED, share * dx, share * dy, -DRAG_DEPTH * self.block_m - height, 0.0
+        )
 
     @property
     def objects(self) -> Sequence[Body]:

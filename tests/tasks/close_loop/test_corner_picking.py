@@ -138,3 +138,47 @@ def test_the_expert_descends_while_it_moves_and_turns_to_the_press(env):
     assert near.dx_m < -0.005
     assert near.dy_m < -0.005
     assert near.dyaw_rad == pytest.approx(-0.2, abs=0.02)
+
+
+def test_labels_do_not_change_with_millimetres(env):
+    """An image shows heights in steps of 1.5 mm."""
+    scene, task = env.scene, env.scene.task
+    env.reset()
+    task.put_corner((0.45, 0.0), 0.0)
+    (x, y, z), offset_m = task.block.position, 0.015
+    on_block_z = z + 0.025 + task._tips_below_m
+
+    def command(above_m, aside_m=0.0):
+        scene.controller.reset(((x + offset_m + aside_m, y, on_block_z + above_m), 0.0), 0.0)
+        return task.expert_command()
+
+    for above_m in (-2e-3, 0.0, 2e-3):  # on the block, it drags away from both walls
+        for aside_m in (-5e-3, 0.0, 5e-3):
+            assert min(command(above_m, aside_m)[1:3]) > 0.04
+    for above_m in (8e-3, 0.012):  # above it, it presses deeper than any error of the height
+        assert command(above_m).dz_m == pytest.approx(-above_m - 8e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.7, math.pi / 2])
+def test_open_fingers_turn_by_at_most_an_eighth_of_a_circle(env, turn):
+    """At a quarter, the two directions are equally far."""
+    scene, task = env.scene, env.scene.task
+    env.reset()
+    task.put_corner((0.45, 0.0), 0.0)
+    for xy in ((-0.045, 0.0), (0.0, -0.045), (0.02, 0.02)):  # of clearance at one yaw, at both
+        task.block.place((*task.corner.to_world(*xy), 0.027), 0.0)
+        x, y, z = task.block.position
+        scene.controller.reset(((x, y, z + 0.06), turn))
+        command = task.expert_command()
+        assert abs(command.dyaw_rad) <= math.pi / 4 + 1e-6
+
+
+def test_open_fingers_around_the_block_close(env):
+    """Also in a position that leaves less than the margin of a descent."""
+    scene, task = env.scene, env.scene.task
+    env.reset()
+    task.put_corner((0.45, 0.0), 0.0)
+    task.block.place((*task.corner.to_world(0.02, 0.02), 0.027), 0.0)
+    x, y, z = task.block.position
+    scene.controller.reset(((x + 0.012, y + 0.015, z + 3e-3), 0.1))
+    assert task.expert_command().opening == 0.0
