@@ -77,7 +77,7 @@ class MyAlgorithm(Learner):
         loss.make_value_estimator(gamma=self.config.gamma)
         return loss
 
-    def make_stages(self):
+    def make_stages(self, loss):
         """Return the losses of an update, each minimised after a step on the one before."""
         return [self.critic_loss, self.actor_loss]
 
@@ -95,6 +95,6 @@ class MyAlgorithm(Learner):
         value, found = self.loss.actor_loss(batch)
         return TensorDict({"loss_actor": value, "bc_loss": found["bc_loss"]})
 
-    def make_target_updater(self):
+    def make_target_updater(self, loss):
         """Return the soft update of the targets of policy and critics."""
-        return SoftUpdate(self.loss, tau=self.config.tau)
+        return SoftUpdate(loss, tau=self.config.tau)

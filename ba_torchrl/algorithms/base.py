@@ -55,9 +55,12 @@ __all__ = [
 class Learner(ABC):
     """Networks, a loss, an optimiser and a replay, which `ba_torchrl.training.experiment` fills.
 
-    The constructor calls the ``make_...`` methods. An algorithm implements the first three and can
-    override the others. An update minimises the sums of the ``loss_...`` entries of its stages one
-    after the other, by default that of the loss module.
+    The constructor calls the ``make_...`` methods, which get as arguments what earlier ones made;
+    of the learner, they use `config`, `problem`, `images`, `vectors` and `observation_keys` alone.
+    An algorithm implements the first three and can override the others.
+
+    An update minimises the sums of the ``loss_...`` entries of its stages one after the other, by
+    default that of the loss module.
 
     On a CUDA device the host does not wait for an update: batches are copied as uint8 codes from
     pinned memory, and priorities are set, and losses checked, at the end of the next update. From a
@@ -99,15 +102,15 @@ class Learner(ABC):
         self.policy = ActingPolicy(
             acting, self.make_acting_transforms(), self.make_exploration()
         ).to(problem.device)
-        self.stages = self.make_stages()
-        self.first_losses = self.make_first_losses()
-        updater = self.make_target_updater()
+        self.stages = self.make_stages(self.loss)
+        self.first_losses = self.make_first_losses(self.trained_policy, self.loss)
+        updater = self.make_target_updater(self.loss)
         self.target_updater = None if updater is None else with_buffer_updates(updater)
         self.replay = self.make_replay()
-        for transform in self.make_transforms():
+        for transform in self.make_transforms(networks):
             self.replay.append_transform(transform)
-        self.optimizer = self.make_optimizer()
-        self.stepper = self.make_stepper()
+        self.optimizer = self.make_optimizer(self.loss)
+        self.stepper = self.make_stepper(self.optimizer, self.loss)
 
     @property
     def network_spec(self) -> ActorCriticSpec:
@@ -148,12 +151,14 @@ class Learner(ABC):
         default None, which leaves exploration to the policy's distribution."""
         return None
 
-    def make_stages(self) -> list[LossFunction]:
+    def make_stages(self, loss: LossModule) -> list[LossFunction]:
         """Return the losses of an update in the order in which they are minimised, each after the
         optimisers' step on the one before; by default the loss module alone."""
-        return [self.loss]
+        return [loss]
 
-    def make_first_losses(self) -> list[tuple[int, LossFunction]]:
+    def make_first_losses(
+        self, policy: TensorDictModuleBase, loss: LossModule
+    ) -> list[tuple[int, LossFunction]]:
         """Return numbers of first updates of a run, and the loss that each number of updates
         minimises instead of the stages; by default none."""
         return []
@@ -164,7 +169,7 @@ class Learner(ABC):
         than its critics leaves one out."""
         return self.stages
 
-    def make_target_updater(self) -> TargetNetUpdater | None:
+    def make_target_updater(self, loss: LossModule) -> TargetNetUpdater | None:
         """Return the updater of the target network, None if there is no target network."""
         return None
 
@@ -173,44 +178,46 @@ class Learner(ABC):
         seed, size = self.problem.derived_seed(SeedUse.REPLAY), self.config.batch_size
         return self.config.replay.build(size, self.images, seed, self.problem.device)
 
-    def make_transforms(self) -> list[Transform]:
+    def make_transforms(self, networks: Any) -> list[Transform]:
         """Return the transforms of the replay, called on sampled batches and, their inverse, on new
         transitions; by default none."""
         return []
 
-    def make_optimizer(self) -> Optimizer:
+    def make_optimizer(self, loss: LossModule) -> Optimizer:
         """Return the optimiser of all terms of the loss but those of `make_term_optimizers`."""
-        return self.adam(self.loss.parameters())
+        return self.adam(loss.parameters(), loss)
 
-    def make_term_optimizers(self) -> Mapping[str, Mapping[str, Optimizer]]:
+    def make_term_optimizers(self, loss: LossModule) -> Mapping[str, Mapping[str, Optimizer]]:
         """Return the optimisers of single terms of the loss, by the names of term and optimiser;
         by default none. Their terms are in a stage without others."""
         return {}
 
-    def make_stepper(self) -> OptimizationStepper:
+    def make_stepper(self, optimizer: Optimizer, loss: LossModule) -> OptimizationStepper:
         """Return what takes the gradient steps of an update: by default all optimisers with their
         schedules. One of TorchRL's takes a step of `optimizer` on the sum of all stages, without a
         schedule."""
         return Optimizers(
-            self.optimizer,
-            self.make_term_optimizers(),
+            optimizer,
+            self.make_term_optimizers(loss),
             self.make_scheduler,
             clamp=self.config.optimizer.gradient_clamp,
-            clamped=self.network_parameters(),
+            clamped=self.network_parameters(loss),
         )
 
     def make_scheduler(self, optimizer: Optimizer) -> LRScheduler:
         """Return the schedule of an optimiser's learning rate, which steps once per update."""
         return self.config.optimizer.schedule(optimizer, self.problem.total_updates)
 
-    def adam(self, parameters: Iterable[nn.Parameter], factor: float = 1.0) -> Optimizer:
-        """Return Adam for some parameters with a factor on the learning rate, and with weight decay
-        on those of the networks only."""
-        return self.config.optimizer.adam(parameters, self.network_parameters(), factor)
+    def adam(
+        self, parameters: Iterable[nn.Parameter], loss: LossModule, factor: float = 1.0
+    ) -> Optimizer:
+        """Return Adam for some parameters of a loss with a factor on the learning rate, and with
+        weight decay on those of the networks only."""
+        return self.config.optimizer.adam(parameters, self.network_parameters(loss), factor)
 
-    def network_parameters(self) -> list[nn.Parameter]:
-        """Return the parameters to which weight decay and the gradient's bound apply."""
-        return list(self.loss.parameters())
+    def network_parameters(self, loss: LossModule) -> list[nn.Parameter]:
+        """Return the parameters of a loss to which weight decay and the gradient's bound apply."""
+        return list(loss.parameters())
 
     # -- data --------------------------------------------------------------------------------
 

@@ -103,20 +103,22 @@ class BC(Learner):
     """A policy trained on demonstrations only."""
 
     config: ImitationConfig
-    actions: SpatialActions | None = None
-    """The grid of actions of an open-loop policy."""
+
+    @property
+    def actions(self) -> SpatialActions | None:
+        """The grid of actions of an open-loop policy; None in close loop."""
+        is_grid = self.problem.control == "open_loop"
+        return self.trained_policy.module.values.actions if is_grid else None
 
     def make_networks(self, network: NetworkConfig) -> nn.Module:
         """Return the actor of an actor-critic network, or a spatial Q network."""
         if self.problem.control == "close_loop":
             return network.build(self.network_spec).actor.to(self.problem.device)
-        values = make_spatial_values(network, self.problem, self.images)
-        self.actions = values.actions
-        return values
+        return make_spatial_values(network, self.problem, self.images)
 
     def make_policy(self, networks: nn.Module) -> TensorDictModuleBase:
         """Return the policy."""
-        if self.actions is None:
+        if self.problem.control == "close_loop":
             return squashed_gaussian_policy(networks, self.observation_keys)
         seed = self.problem.derived_seed(SeedUse.EXPLORATION)
         return spatial_policy(SpatialPolicy(networks, seed))
@@ -124,19 +126,19 @@ class BC(Learner):
     def make_loss(self, networks: nn.Module) -> LossModule:
         """Return the divergence of sampled actions from the expert's, with gradients at the ends of
         the range, or the cross-entropy of every level's values with the expert's choice."""
-        if self.actions is None:
+        if self.problem.control == "close_loop":
             loss = BehaviourCloningLoss(self.make_policy(networks), "kl")
         else:
             loss = LevelCrossEntropyLoss(networks)
         loss.set_keys(action=keys.TARGET_ACTION)
         return loss
 
-    def make_transforms(self) -> list[Transform]:
+    def make_transforms(self, networks: nn.Module) -> list[Transform]:
         """Return the rotation or the rigid transforms of sampled transitions."""
         rotation = self.config.rotation
-        if self.actions is None:
+        if self.problem.control == "close_loop":
             return rotation.build(self.problem, self.images, self.vectors)
-        return rotation.build(self.problem, self.images, self.actions, keys.TARGET_ACTION)
+        return rotation.build(self.problem, self.images, networks.actions, keys.TARGET_ACTION)
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the policy can choose."""

@@ -125,10 +125,12 @@ class IQL(Learner):
         loss.make_value_estimator(gamma=self.config.gamma)
         return loss
 
-    def make_first_losses(self) -> list[tuple[int, LossFunction]]:
+    def make_first_losses(
+        self, policy: ProbabilisticActor, loss: EvalModeTargetsIQLLoss
+    ) -> list[tuple[int, LossFunction]]:
         """Return the loss of the initialisation."""
-        return self.config.init.build(self.trained_policy)
+        return self.config.init.build(policy)
 
-    def make_target_updater(self) -> SoftUpdate:
+    def make_target_updater(self, loss: EvalModeTargetsIQLLoss) -> SoftUpdate:
         """Return the soft update of the critics' targets."""
-        return SoftUpdate(self.loss, tau=self.config.tau)
+        return SoftUpdate(loss, tau=self.config.tau)

@@ -111,8 +111,8 @@ class SAC(Learner):
     loss: SACfDLoss
 
     def __init__(self, config: SACConfig, network: NetworkConfig, problem: Problem) -> None:
-        self.episodes = config.imitation.build()
         super().__init__(config, network, problem)
+        self.episodes = config.imitation.build()
 
     @property
     def seen_images(self) -> Mapping[str, ImageSpec]:
@@ -181,32 +181,33 @@ class SAC(Learner):
             loss.set_keys(terminated=loss.tensor_keys.done)
         return loss.make_value_estimator(gamma=config.gamma)
 
-    def make_stages(self) -> list[LossFunction]:
+    def make_stages(self, loss: SACfDLoss) -> list[LossFunction]:
         """Return the loss of actor, critics and temperature and, if configured, then the
         contrastive one."""
-        contrastive = [] if self.loss.contrastive is None else [self.loss.contrastive_loss]
-        return [self.loss, *contrastive]
+        return [loss] if loss.contrastive is None else [loss, loss.contrastive_loss]
 
-    def make_first_losses(self) -> list[tuple[int, LossFunction]]:
+    def make_first_losses(
+        self, policy: ProbabilisticActor, loss: SACfDLoss
+    ) -> list[tuple[int, LossFunction]]:
         """Return the loss of the initialisation, and the contrastive one."""
         config = self.config
-        contrastive = (config.contrastive.updates, self.loss.contrastive_loss)
-        return [*config.init.build(self.trained_policy), contrastive]
+        contrastive = (config.contrastive.updates, loss.contrastive_loss)
+        return [*config.init.build(policy), contrastive]
 
-    def make_target_updater(self) -> SoftUpdate:
+    def make_target_updater(self, loss: SACfDLoss) -> SoftUpdate:
         """Return the soft update of the targets of critic and encoder."""
         config = self.config
         if config.encoder_tau is None:
-            return SoftUpdate(self.loss, tau=config.tau)
+            return SoftUpdate(loss, tau=config.tau)
         taus = {"encoder_network": config.encoder_tau}
-        return SoftUpdateByNetwork(self.loss, tau=config.tau, taus=taus)
+        return SoftUpdateByNetwork(loss, tau=config.tau, taus=taus)
 
     @property
     def entries_per_transition(self) -> int:
         """A transition and its rotated copies."""
         return 1 + self.config.rotation.copies
 
-    def make_transforms(self) -> list[Transform]:
+    def make_transforms(self, networks: ActorCritic) -> list[Transform]:
         """Return the rotation, of stored copies or of sampled transitions, and the views of images,
         if configured."""
         config = self.config
@@ -219,26 +220,23 @@ class SAC(Learner):
         )
         return rotation + views
 
-    def make_optimizer(self) -> Optimizer:
+    def make_optimizer(self, loss: SACfDLoss) -> Optimizer:
         """Return Adam for all parameters but the contrastive loss's similarity."""
-        contrastive = self.loss.contrastive
-        if contrastive is None:
-            return super().make_optimizer()
-        own = set(map(id, contrastive.parameters()))
-        return self.adam(p for p in self.loss.parameters() if id(p) not in own)
+        if loss.contrastive is None:
+            return super().make_optimizer(loss)
+        own = set(map(id, loss.contrastive.parameters()))
+        return self.adam((p for p in loss.parameters() if id(p) not in own), loss)
 
-    def make_term_optimizers(self) -> dict[str, dict[str, Optimizer]]:
+    def make_term_optimizers(self, loss: SACfDLoss) -> dict[str, dict[str, Optimizer]]:
         """Return the optimisers of the contrastive loss, if configured: one for the encoder, one
         for encoder and similarity, as in the reference implementation."""
-        contrastive = self.loss.contrastive
-        if contrastive is None:
+        if loss.contrastive is None:
             return {}
-        encoder = list(self.loss.encoder_network_params.parameters())
-        chosen = {"encoder": encoder, "contrastive": [*encoder, *contrastive.parameters()]}
+        encoder = list(loss.encoder_network_params.parameters())
+        chosen = {"encoder": encoder, "contrastive": [*encoder, *loss.contrastive.parameters()]}
         weight = self.config.contrastive.weight
-        return {
-            "loss_contrastive": {name: self.adam(each, weight) for name, each in chosen.items()}
-        }
+        optimizers = {name: self.adam(each, loss, weight) for name, each in chosen.items()}
+        return {"loss_contrastive": optimizers}
 
     def on_collected(self, data: TensorDictBase) -> None:
         """Store collected steps; if successes are imitated, the episodes that have ended, of which
@@ -270,6 +268,6 @@ class SAC(Learner):
         if self.episodes is not None:
             self.episodes.load_state_dict(state["episodes"])
 
-    def network_parameters(self) -> list[nn.Parameter]:
+    def network_parameters(self, loss: SACfDLoss) -> list[nn.Parameter]:
         """Return all parameters but the entropy temperature."""
-        return [p for p in self.loss.parameters() if p is not self.loss.log_alpha]
+        return [p for p in loss.parameters() if p is not loss.log_alpha]

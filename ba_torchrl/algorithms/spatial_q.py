@@ -84,13 +84,12 @@ class SpatialQ(Learner):
 
     def __init__(self, config: SpatialQConfig, network: NetworkConfig, problem: Problem) -> None:
         super().__init__(config, network, problem)
+        self.actions = self.trained_policy.module.values.actions
         self._set_epsilon()
 
     def make_networks(self, network: NetworkConfig) -> SpatialValues:
         """Return the network, wrapped as values of the environment's actions."""
-        values = make_spatial_values(network, self.problem, self.images)
-        self.actions = values.actions
-        return values
+        return make_spatial_values(network, self.problem, self.images)
 
     def make_policy(self, networks: SpatialValues) -> TensorDictModule:
         """Return the epsilon-greedy policy."""
@@ -113,14 +112,14 @@ class SpatialQ(Learner):
         )
         return loss.make_value_estimator(gamma=config.gamma)
 
-    def make_target_updater(self) -> HardUpdate:
+    def make_target_updater(self, loss: LevelDQNLoss) -> HardUpdate:
         """Return the updater that copies the network to its target."""
         # TorchRL copies when its counter exceeds the interval, one update later.
-        return HardUpdate(self.loss, value_network_update_interval=self.config.target_interval - 1)
+        return HardUpdate(loss, value_network_update_interval=self.config.target_interval - 1)
 
-    def make_transforms(self) -> list[Transform]:
+    def make_transforms(self, networks: SpatialValues) -> list[Transform]:
         """Return the rigid transforms of sampled transitions."""
-        return self.config.rotation.build(self.problem, self.images, self.actions)
+        return self.config.rotation.build(self.problem, self.images, networks.actions)
 
     def nearest_action(self, action: Tensor) -> Tensor:
         """Return the nearest action that the network's levels can choose."""

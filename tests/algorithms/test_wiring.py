@@ -269,3 +269,34 @@ def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
     draws = {name: tuple(torch.rand(4, generator=g).tolist()) for name, g in generators.items()}
     draws["weights"] = tuple(torch.rand(4).tolist())
     assert len(set(draws.values())) == len(draws), draws
+
+
+@pytest.mark.parametrize(
+    ("name", "network", "settings"),
+    [
+        ("sac", "cnn", {**tiny.FERM, "imitation": {"name": "successes"}}),
+        ("rlpd", "cnn", {}),
+        ("iql", "cnn", {}),
+        ("bc", "asr", {}),
+        ("spatial_q", "asr", {}),
+    ],
+)
+def test_parts_are_made_of_what_they_are_given(name, network, settings):
+    """None is read from the learner, whose constructor makes them one after the other."""
+    learner = tiny.build(name, network, **settings)
+    policy, loss, optimizer = learner.trained_policy, learner.loss, learner.optimizer
+    inputs = {"config", "problem", "images", "vectors", "observation_keys"}
+    for part in vars(learner).keys() - inputs:
+        delattr(learner, part)
+    networks = learner.make_networks(tiny.network_config(network))
+    assert learner.make_policy(networks).out_keys == policy.out_keys
+    assert learner.make_loss(networks).state_dict().keys() == loss.state_dict().keys()
+    assert isinstance(learner.make_transforms(networks), list)
+    assert learner.make_stages(loss)[0] is loss
+    assert isinstance(learner.make_first_losses(policy, loss), list)
+    updater = learner.make_target_updater(loss)
+    assert updater is None or updater.loss_module is loss
+    assert learner.make_optimizer(loss).param_groups
+    assert learner.make_stepper(optimizer, loss).of(["loss_actor"]) == [optimizer]
+    parts = learner.make_acting_transforms(), learner.make_exploration(), learner.make_replay()
+    assert len(parts[2]) == 0

@@ -35,7 +35,7 @@ def test_a_behaviour_cloning_algorithm_trains(tmp_path, pretrain_updates):
 
 def test_overriding_one_method_replaces_one_part(additions, tmp_path):
     class Augmented(additions["behaviour_cloning"].BehaviourCloning):
-        def make_transforms(self):
+        def make_transforms(self, networks):
             return [SO2Augmentation(self.images, self.problem.actions.sequence, seed=0)]
 
     config = make_experiment(tmp_path, "cnn", BATCH).config
