@@ -214,6 +214,7 @@ def test_a_file_acts_like_the_run(run, tmp_path):
     for weight, before in zip(policy.policy.state_dict().values(), trained, strict=True):
         torch.testing.assert_close(weight, before, rtol=2**-11, atol=2**-25)
     path = tmp_path / "p.safetensors"
+    policy.versions = policy.versions._replace(expert=7)  # the run's result knows which took part
     result = policies.save_policy(policy, path, with_outcomes(1, 1, 0, 1))
     assert list(tmp_path.iterdir()) == [path]
     again = ba_torchrl.load_policy(path)
