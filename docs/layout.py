@@ -54,10 +54,10 @@ SUBJECTS = (
         ("tasks.open_loop.block_stacking.BlockStacking",),
         ("tasks",),
     ),
-    Subject("SACfD", ("algorithms.sac.SACConfig",), ("algorithms", "objectives"), 2000),
+    Subject("SACfD", ("algorithms.sac.SAC",), ("algorithms", "objectives"), 2000),
     Subject(
         "SDQfD with Equi ASR",
-        ("algorithms.spatial_q.SpatialQConfig", "modules.spatial.equi_asr.EquiASRConfig"),
+        ("algorithms.spatial_q.SpatialQ", "modules.spatial.equi_asr.build_equi_asr"),
         ("algorithms", "objectives", "modules.spatial"),
         2600,
     ),

@@ -83,13 +83,13 @@ def cuda(monkeypatch):
 
 @pytest.fixture(scope="session")
 def composed_presets():
-    """`hydra_schema.preset`, which composes each preset once in all tests."""
-    from ba_torchrl.training import hydra_schema
+    """`presets.preset`, which composes each preset once in all tests."""
+    from ba_torchrl.training import presets
 
-    return functools.cache(hydra_schema.preset)
+    return functools.cache(presets.preset)
 
 
 @pytest.fixture
 def cached_presets(composed_presets, monkeypatch):
     """Grids of the command line take presets that an earlier test has composed."""
-    monkeypatch.setattr("ba_torchrl.training.hydra_schema.preset", composed_presets)
+    monkeypatch.setattr("ba_torchrl.training.presets.preset", composed_presets)

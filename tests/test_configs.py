@@ -4,16 +4,13 @@ from functools import cache
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
 from ba_torchrl.algorithms import base as registries
 from ba_torchrl.commands import train
 from ba_torchrl.core.config import parse
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.presets import preset, started
 
 CONFIGS = Path(__file__).parents[1] / "configs"
 ALGORITHMS, NETWORKS = (
@@ -23,13 +20,9 @@ ALGORITHMS, NETWORKS = (
 
 
 def experiment(name, *overrides):
-    hydra_schema.register()
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        settings = compose(name, overrides=list(overrides), return_hydra_config=True)
-    HydraConfig.instance().set_config(settings)
-    own = OmegaConf.masked_copy(settings, [key for key in settings if key != "hydra"])
-    values = OmegaConf.to_container(own, resolve=True)
-    return ExperimentConfig.parse(values)
+    arguments = train.COMMAND.read(["--config-name", name, *overrides])
+    with train.COMMAND.composed(arguments) as settings:
+        return train.parse(OmegaConf.to_container(settings, resolve=True), arguments)
 
 
 TASK_OF = {"close_loop": "close_loop/block_picking", "open_loop": "open_loop/block_stacking"}
@@ -38,10 +31,9 @@ TASK_OF = {"close_loop": "close_loop/block_picking", "open_loop": "open_loop/blo
 @cache
 def presets(group):
     """The values of each preset of a group."""
-    hydra_schema.register()
     names = sorted(path.stem for path in (CONFIGS / group).glob("*.yaml"))
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return {name: hydra_schema.preset(group, name) for name in names}
+    with started(CONFIGS):
+        return {name: preset(group, name) for name in names}
 
 
 def controls_of(algorithm):
@@ -85,9 +77,8 @@ def test_every_network_composes(network):
 
 @cache
 def method(name):
-    hydra_schema.register()
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        values = hydra_schema.preset("algorithm", name)
+    with started(CONFIGS):
+        values = preset("algorithm", name)
     return parse(registries.ALGORITHMS[values.pop("name")], values, name)
 
 
@@ -103,7 +94,7 @@ def test_a_method_is_an_algorithm_a_replay_and_a_rotation(name):
     lines += ["algorithm.imitation.name=none"] if "sac" in parts[1:] else []
     if parts[0] == "sdqfd":
         lines += ["task=open_loop/block_stacking", "network=asr"]
-    assert experiment("train", *lines).algorithm_config == method(name)
+    assert experiment("train", *lines).algorithm == method(name)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +121,7 @@ def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
     for algorithm in ("dqn",) if is_open_loop else ("sac", "bc"):
         config = experiment(name, f"algorithm={algorithm}")
         assert config.label.startswith(f"{algorithm} ")
-        assert config.algorithm_config == method(algorithm)
+        assert config.algorithm == method(algorithm)
 
 
 @pytest.mark.parametrize(
@@ -154,12 +145,11 @@ def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
 )
 def test_a_part_that_replaces_that_of_a_preset_keeps_the_values_that_it_has(words, part, options):
     arguments = train.COMMAND.read(["--config-name=quickstart", *words])
-    hydra_schema.register()
     with train.COMMAND.composed(arguments) as settings:
         values = OmegaConf.to_container(settings, resolve=True)
         if options is None:  # the user's own value
             with pytest.raises(ConfigError, match=r"unknown.*imitation.name=demonstrations or"):
                 train.parse(values, arguments)
         else:
-            config = train.parse(values, arguments).algorithm_config
+            config = train.parse(values, arguments).algorithm
             assert getattr(config, part).model_dump() == options

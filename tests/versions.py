@@ -173,18 +173,13 @@ def check_vector() -> None:
 
 def updates() -> list[tuple[str, object]]:
     """Return a check for each algorithm and for each network: one update."""
-    from hydra import initialize_config_dir
-
     from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
     from ba_torchrl.cli import config_dir
-    from ba_torchrl.training import hydra_schema
+    from ba_torchrl.training.presets import preset, preset_names, started
 
-    hydra_schema.register()
-    with initialize_config_dir(str(config_dir()), version_base="1.3"):
+    with started(config_dir()):
         presets = {
-            group: {
-                name: hydra_schema.preset(group, name) for name in hydra_schema.preset_names(group)
-            }
+            group: {name: preset(group, name) for name in preset_names(group)}
             for group in ("algorithm", "network")
         }
     usual = {
@@ -240,7 +235,7 @@ def check_update(values: dict[str, object]) -> None:
         env.close()
     learner.on_demonstrations(episodes)
     learner.update()
-    if config.algorithm_config.collects:
+    if config.algorithm.collects:
         learner.update()
 
 

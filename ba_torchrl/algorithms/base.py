@@ -27,15 +27,18 @@ from ba_torchrl.algorithms.compilation import CompiledLoss, CompileMode
 from ba_torchrl.algorithms.config import ALGORITHMS, LearnerConfig
 from ba_torchrl.algorithms.host_tasks import IS_FINITE, HostTasks, check_finite
 from ba_torchrl.algorithms.optimizers import LossFunction, Optimizers, Update
-from ba_torchrl.algorithms.problem import Problem, SeedUse, derive_seed
+from ba_torchrl.algorithms.problem import Problem
 from ba_torchrl.core import keys
+from ba_torchrl.core.choices import Control
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
+from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.data.replay.codecs import ImageCodecs
 from ba_torchrl.data.replay.prioritized import ExpertPrioritizedSampler
 from ba_torchrl.data.transfer import batch_to_device
 from ba_torchrl.data.transitions import as_transitions
-from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec, Control, NetworkConfig
+from ba_torchrl.modules.base import ActorCriticSpec
+from ba_torchrl.modules.config import NETWORKS, NetworkConfig
 from ba_torchrl.objectives.networks import with_buffer_updates
 
 __all__ = [

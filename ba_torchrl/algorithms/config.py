@@ -2,29 +2,36 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from typing import Any, ClassVar
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from pydantic import Field, model_validator
 from typing_extensions import Self
 
 from ba_torchrl.algorithms.parts.optimizer import OptimizerConfig
 from ba_torchrl.algorithms.parts.replay import Replay, Uniform
-from ba_torchrl.algorithms.problem import Problem
+from ba_torchrl.core.choices import Control, Imitation
 from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.errors import PartError
 from ba_torchrl.core.registry import Registry
-from ba_torchrl.data.transitions import Imitation
-from ba_torchrl.modules.base import NETWORKS, Control, NetworkConfig
+from ba_torchrl.modules.config import NETWORKS, NetworkConfig
+
+if TYPE_CHECKING:
+    from ba_torchrl.algorithms.problem import Problem
 
 
-class LearnerConfig(StrictModel, ABC):
+class LearnerConfig(StrictModel):
     """Hyper-parameters of an algorithm, from which it is built for a network and a problem.
+
+    Its module imports no torch: those of this package name the class of the algorithm in `learner`.
+    Another one can override `build` instead.
 
     Learning rate, batch and replay are those of appendix G.2. Each other field says where its
     default is from.
     """
 
+    learner: ClassVar[str]
+    """The `ba_torchrl.algorithms.base.Learner`, as "module:Class", which `build` imports."""
     controls: ClassVar[frozenset[Control]]
     """Controls of the tasks that the algorithm supports."""
     collects: ClassVar[bool] = True
@@ -70,11 +77,11 @@ class LearnerConfig(StrictModel, ABC):
             why, name = f"is for {network.control} tasks", NETWORKS.name_of(type(network))
             raise PartError("network", name, why, known, f"{control} tasks")
 
-    @abstractmethod
     def build(self, network: NetworkConfig, problem: Problem) -> Any:
         """Return a freshly initialised `ba_torchrl.algorithms.base.Learner`."""
+        return resolve_name(self.learner)(self, network, problem)
 
 
 ALGORITHMS: Registry[type[LearnerConfig]] = Registry(
-    "algorithm", "ba_torchrl.algorithms", LearnerConfig
+    "algorithm", "ba_torchrl.algorithms", LearnerConfig, "_config"
 )

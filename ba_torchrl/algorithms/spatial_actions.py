@@ -11,7 +11,7 @@ from ba_torchrl.algorithms.base import Problem
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import OpenLoopActions
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.modules.base import NetworkConfig
+from ba_torchrl.modules.config import NetworkConfig
 from ba_torchrl.modules.spatial.base import SpatialSpec
 from ba_torchrl.modules.spatial.policy import SpatialActions, SpatialValues
 

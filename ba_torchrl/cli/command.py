@@ -1,38 +1,31 @@
-"""A command: Hydra composes its settings, a model validates them, and a function does the work."""
+"""A command: words and presets are settings, a model validates them, a function does the work."""
 
 from __future__ import annotations
 
 import argparse
 import logging
 import os
-import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
-from hydra import compose, initialize_config_dir
-from hydra.core.config_store import ConfigStore
-from hydra.core.hydra_config import HydraConfig
-from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf, open_dict
-from omegaconf.errors import ConfigAttributeError, ConfigKeyError
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+from yaml import YAMLError
 
 from ba_torchrl.cli import PROGRAM, config_dir
-from ba_torchrl.cli.errors import name_presets, plain_errors
-from ba_torchrl.cli.help import describe
-from ba_torchrl.core.config import expanded, parse, takes_path
+from ba_torchrl.cli.errors import plain_errors
+from ba_torchrl.core.config import defaults_of, expanded, parse, takes_list, takes_text
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
-from ba_torchrl.core.plugins import has_entry_points, load_plugins
+from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.results import flat
-from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.config import ExperimentConfig
 
 LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
 
@@ -41,8 +34,10 @@ LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
 class Arguments:
     """The parts of a command line."""
 
-    overrides: Sequence[str] = ()
-    """In Hydra's grammar, such as ``env.obs_size=64``."""
+    given: Mapping[str, Any] = field(default_factory=dict)
+    """The settings."""
+    presets: Sequence[str] = ()
+    """Of a command with a configuration: choices of presets in Hydra's grammar."""
     config_name: str | None = None
     """Of another configuration than the command's own."""
     config_dir: str | None = None
@@ -52,14 +47,7 @@ class Arguments:
     @property
     def names(self) -> set[str]:
         """The settings that are given, such as ``env.obs_size``."""
-        return {override.split("=")[0].lstrip("+~") for override in self.overrides}
-
-    @property
-    def fields(self) -> set[str]:
-        """The same, with the fields of one that is given in braces, such as ``algorithm.init.name``
-        for ``algorithm.init={name: bc}``; Hydra has read the settings."""
-        parsed = OverridesParser.create().parse_overrides([*self.overrides])
-        return self.names | flat({each.key_or_group: each.value() for each in parsed}).keys()
+        return {*flat(self.given)}
 
 
 @dataclass(frozen=True)
@@ -69,70 +57,70 @@ class Command:
     main: Callable[[Any], None]
     """Does the work, with the validated settings."""
     settings: type[BaseModel]
-    """Model of the settings. Without ``config``, its defaults are those of the command."""
+    """Model of the settings, whose defaults are those of the command."""
     positional: str | None = None
     """Field that words without "=" set, or several, "kind name", each set by one word."""
     config: str | None = None
     """Name of the configuration file that is used unless ``--config-name`` is given."""
     variants: str = ""
     """Pattern of the names of other configuration files that the package has for this command."""
+    further: type[BaseModel] | None = None
+    """Model whose fields can be set besides."""
     parse: Callable[[dict[str, Any], Arguments], Any] | None = None
     """Returns what ``main`` gets; by default an instance of ``settings``."""
-    check: Callable[[dict[str, Any]], object] | None = None
-    """Of a command with a configuration: refuses wrong settings as far as this needs no torch."""
 
     @property
     def name(self) -> str:
         """The command's name, that of its module."""
         return self.main.__module__.split(".")[-1]
 
+    @property
+    def fields(self) -> dict[str, FieldInfo]:
+        """The fields that can be set."""
+        further = {} if self.further is None else self.further.model_fields
+        return {**further, **self.settings.model_fields}
+
     @plain_errors
     def run(self, words: Sequence[str] | None = None) -> None:
         """Run the command; an error in its arguments is one line, and ends the process."""
         arguments = self.read(sys.argv[1:] if words is None else words)
-        if self.config is None:
-            load_plugins(hydra_schema.plugins_in(arguments.overrides))
-        elif self._is_answered_early(arguments):
-            return
-        else:
-            hydra_schema.register(arguments.overrides)
-        with self.composed(arguments) as settings:  # an unknown name ends it here
+        plugins = arguments.given.get("plugins", ())
+        load_plugins([plugins] if isinstance(plugins, str) else plugins)
+        with self.composed(arguments) as settings:
             if arguments.asks_for_help:
-                print(self._help(settings, with_choices=True))  # noqa: T201
+                from ba_torchrl.cli.help import describe
+
+                words = "".join(f" [{name.upper()}]" for name in (self.positional or "").split())
+                usage = f"{self.name}{words} [FIELD=VALUE ...]"
+                text = sys.modules[self.main.__module__].__doc__ or ""
+                values = OmegaConf.to_container(settings)
+                print(describe(usage, text, self.settings, values, self.config_names()))  # noqa: T201
                 return
             logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
             limit_library_logs()
-            self._apply(lambda values: self.main(self._parsed(values, arguments)), settings)
+            self._run(arguments, settings)
 
-    def _parsed(self, values: dict[str, Any], arguments: Arguments) -> Any:
-        if self.parse is None:
-            return parse(self.settings, values, "settings")
-        return self.parse(values, arguments)
+    def _run(self, arguments: Arguments, settings: DictConfig) -> None:
+        for name in settings:
+            if name not in self.fields:
+                raise UnknownNameError("setting", name, self.fields)
+        for name, info in self.fields.items():
+            if OmegaConf.is_missing(settings, name) or (
+                name in self.settings.model_fields and info.is_required() and name not in settings
+            ):
+                raise ConfigError(f"{name} is missing; see --help")
+        values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
+        try:
+            if self.parse is None:
+                self.main(parse(self.settings, values, "settings"))
+            else:
+                self.main(self.parse(values, arguments))
+        except ConfigError as error:
+            if self.config is not None:
+                from ba_torchrl.training.presets import name_presets
 
-    def _is_answered_early(self, arguments: Arguments) -> bool:
-        """Refuse what is wrong, or print the help, without the import of torch, which takes
-        seconds; return whether the command line is answered.
-
-        Plugins and further folders can have other presets, so that the answer has to wait.
-        """
-        if arguments.config_dir or "plugins" in arguments.names or has_entry_points():
-            return False
-        hydra_schema.register_open(config_dir())
-        groups = {name.split(".")[0] for name in arguments.names} & {*hydra_schema.GROUPS}
-        with self.composed(arguments) as settings:
-            if arguments.asks_for_help and not groups:
-                print(self._help(settings, with_choices=False))  # noqa: T201
-                return True
-            if self.check is not None and not arguments.asks_for_help:
-                self._apply(self.check, settings)
-        return False
-
-    def _help(self, settings: DictConfig, with_choices: bool) -> str:
-        words = "".join(f" [{name.upper()}]" for name in (self.positional or "").split())
-        usage = f"{self.name}{words} [FIELD=VALUE ...]"
-        text = sys.modules[self.main.__module__].__doc__ or ""
-        values = OmegaConf.to_container(settings)
-        return describe(usage, text, self.settings, values, self.config_names(), with_choices)
+                name_presets(error, settings)
+            raise
 
     def config_names(self, further: str | None = None) -> list[str]:
         """Return the names that ``--config-name`` takes."""
@@ -163,47 +151,62 @@ class Command:
         if folder is not None and not Path(folder).is_dir():
             raise ConfigError(f"there is no folder {folder}")
         bare = [word for word in rest if self._is_bare(word)]
-        overrides = [self._readable(word) for word in rest if word not in bare]
+        settings = [word for word in rest if word not in bare]
+        presets = [word for word in settings if self._is_preset(word, folder)]
+        given = OmegaConf.create()
+        for word in settings:
+            if word not in presets:
+                self._set(given, word)
         if bare:
-            overrides += self._positional(bare, overrides)
-        return Arguments(overrides, found.config_name, folder, found.help)
+            given.update(self._positional(bare, given))
+        values = OmegaConf.to_container(given)
+        return Arguments(values, presets, found.config_name, folder, found.help)
 
     def _is_bare(self, word: str) -> bool:
         """Whether a word is the value of a positional field, such as a path with "=" or "~"."""
         if self.config is not None:  # Hydra has groups, "a/b=c", and deletions, "~a"
             return "=" not in word and not word.startswith("~")
         name = word.split("=")[0].lstrip("+")
-        is_setting = name.split(".")[0] in self.settings.model_fields
+        is_setting = name.split(".")[0] in self.fields
         return "=" not in word or "/" in name or (not is_setting and os.path.lexists(word))
 
-    def _readable(self, override: str) -> str:
-        """Return an override with quotes around a text that Hydra cannot read, or would read as
-        something else than a path."""
-        name, is_set, value = override.partition("=")
-        if not is_set or value.startswith(("'", '"', "{", "${")) or value in ("", "null"):
-            return override
-        is_path = name in self._paths
-        is_list = value.startswith("[") and value.endswith("]")
-        if is_list and is_path and not _is_read(override):
-            return f"{name}=[{','.join(_quoted(item.strip()) for item in value[1:-1].split(','))}]"
-        is_text = not value.startswith("[") and (is_path or not _is_read(override))
-        return f"{name}={_quoted(value)}" if is_text else override
+    def _is_preset(self, word: str, further: str | None) -> bool:
+        """Whether a word chooses a preset, or is another one of Hydra's."""
+        if self.config is None:
+            return False
+        group = word.lstrip("+").partition("=")[0].partition("@")[0]
+        folders = [config_dir(), *([] if further is None else [Path(further)])]
+        is_group = bool(group) and any((folder / group).is_dir() for folder in folders)
+        return is_group or group.startswith(("~", "hydra.", "hydra/"))
 
-    @property
-    def _paths(self) -> set[str]:
-        """The settings that are paths."""
-        further = {} if self.config is None else ExperimentConfig.model_fields
-        fields = {**further, **self.settings.model_fields}
-        return {name for name, field in fields.items() if takes_path(field)}
+    def _set(self, given: DictConfig, word: str) -> None:
+        """Set the field of a word such as ``env.obs_size=64``."""
+        name, _, text = word.lstrip("+").partition("=")
+        try:
+            OmegaConf.update(given, name, self._value(name, text), force_add=True)
+        except (YAMLError, OmegaConfBaseException) as error:
+            reason = getattr(error, "problem", None) or str(error).splitlines()[0]
+            raise ConfigError(f"cannot read {word!r}: {reason}") from None
+
+    def _value(self, name: str, text: str) -> Any:
+        """Return the value of a field, which is YAML. Of a field of texts, such as paths, one that
+        is not in quotes may have any sign."""
+        info = self.fields.get(name)
+        if info is not None and takes_text(info):
+            marks = ("'", '"', "[") if takes_list(info) else ("'", '"')
+            if not text.startswith(marks) and text != "null":
+                return text
+        if not text:
+            return text
+        return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]
 
     def _refuse(self, option: str, words: Sequence[str]) -> NoReturn:
         """Refuse an option; if it is the name of a setting, say how to write it."""
         name, _, value = option.lstrip("-").partition("=")
         name = name.replace("-", "_")
-        settings, known = {*self.settings.model_fields}, ["--help"]
+        settings, known = {*self.fields}, ["--help"]
         if self.config is not None:
-            groups = (folder.name for folder in config_dir().iterdir() if folder.is_dir())
-            settings |= {*ExperimentConfig.model_fields, *groups}
+            settings |= {folder.name for folder in config_dir().iterdir() if folder.is_dir()}
             known += ["--config-name", "--config-dir"]
         if name.split(".")[0] not in settings:
             raise UnknownNameError("option", option, known)
@@ -212,98 +215,32 @@ class Command:
             value = "VALUE" if following.startswith("-") or "=" in following else following
         raise ConfigError(f"unknown option {option!r}: write {shlex.join([f'{name}={value}'])}")
 
-    def _positional(self, words: Sequence[str], overrides: Sequence[str]) -> list[str]:
-        """Return the overrides of the positional fields by words without "="."""
+    def _positional(self, words: Sequence[str], given: DictConfig) -> dict[str, Any]:
+        """Return the positional fields that words without "=" set."""
         names = (self.positional or "").split()
         if not names or len(words) > len(names) > 1:
             raise ConfigError(f"{words[-1]!r} sets nothing; settings are FIELD=VALUE, see --help")
         for name in names[: len(words)]:
-            if any(override.startswith(f"{name}=") for override in overrides):
+            if name in given:
                 raise ConfigError(f"{name} is given twice")
-        values = [_quoted(word) for word in words]
-        if len(values) > len(names):
-            values = [f"[{','.join(values)}]"]
-        return [f"{name}={value}" for name, value in zip(names, values, strict=False)]
+        if len(words) > len(names):
+            return {names[0]: list(words)}
+        return dict(zip(names, words, strict=False))
 
     @contextmanager
     def composed(self, arguments: Arguments) -> Iterator[DictConfig]:
         """Context with the settings, in which presets can be composed."""
-        overrides, main_folder = list(arguments.overrides), config_dir()
-        name = arguments.config_name or self.config or self._store_defaults()
+        env = {"env": {}} if "env" in self.fields else {}
+        defaults = OmegaConf.create({**env, **defaults_of(self.settings)})
+        if self.config is None:
+            yield OmegaConf.merge(defaults, arguments.given)
+            return
+        from ba_torchrl.training import presets
+
+        name = arguments.config_name or self.config
         known = self.config_names(arguments.config_dir)
-        if self.config is not None and name not in known:
+        if name not in known:
             raise UnknownNameError("configuration", name, known)
-        if arguments.config_dir is not None:
-            other = Path(arguments.config_dir).resolve()
-            if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
-                main_folder, other = other, main_folder
-            overrides.append(f"hydra.searchpath=[{_quoted(f'file://{other}')}]")
-        with initialize_config_dir(str(main_folder), version_base="1.3", job_name=self.name):
-            try:
-                settings = compose(name, overrides=overrides, return_hydra_config=True)
-            except HydraException as error:
-                raise _explained(error) from None
-            except ValueError as error:  # a preset that is neither a name nor a list
-                raise ConfigError(f"{error}; see --help") from None
-            HydraConfig.instance().set_config(settings)
-            with open_dict(settings):
-                del settings["hydra"]
-            try:
-                yield settings
-            finally:
-                HydraConfig.instance().cfg = None
-
-    def _store_defaults(self) -> str:
-        """Make the model's defaults a configuration; return its name."""
-        values = dict.fromkeys(self.settings.model_fields, "???")
-        node = OmegaConf.create({**values, **hydra_schema.defaults_of(self.settings)})
-        for name in node:
-            if not OmegaConf.is_missing(node, name) and OmegaConf.is_dict(node[name]):
-                OmegaConf.set_struct(node[name], False)  # its entries are checked by the model
-        ConfigStore.instance().store(name=f"_{self.name}", node=node)
-        return f"_{self.name}"
-
-    @staticmethod
-    def _apply(function: Callable[[dict[str, Any]], object], settings: DictConfig) -> None:
-        """Call a function with the values of the settings; its errors name presets."""
-        missing = sorted(name for name in settings if OmegaConf.is_missing(settings, name))
-        if missing:
-            raise ConfigError(f"{missing[0]} is missing; see --help")
-        try:
-            function(OmegaConf.to_container(settings, resolve=True, throw_on_missing=True))
-        except ConfigError as error:
-            name_presets(error, settings)
-            raise
-
-
-def _quoted(word: str) -> str:
-    """Return a text in quotes; backslashes before a quote are doubled, as Hydra reads them."""
-    return "'" + re.sub(r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", "\\'"), word) + "'"
-
-
-def _is_read(override: str) -> bool:
-    """Whether Hydra can read an override."""
-    try:
-        OverridesParser.create().parse_override(override)
-    except HydraException:
-        return False
-    return True
-
-
-def _explained(error: HydraException) -> ConfigError:
-    """Return an error of Hydra, with the known names if it is about one that is unknown."""
-    cause = error.__cause__
-    first = (str(error) or repr(cause)).splitlines()[0]
-    if isinstance(error, OverrideParseException):
-        in_braces = re.search("{.*[~=]", error.override)
-        hint = "; texts in braces with ~ or = need quotes" if in_braces else ""
-        return ConfigError(f"cannot read {error.override!r}: {first}{hint}")
-    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
-        group, _, name = error.missing_cfg_file.rpartition("/")
-        known = [option for option in error.options or () if option != "schema"]
-        return UnknownNameError(group, name, known)
-    if isinstance(cause, ConfigAttributeError | ConfigKeyError):
-        node = cause.parent_node
-        if known := [str(key) for key in node if key != "hydra"] if OmegaConf.is_dict(node) else []:
-            return UnknownNameError("setting", cause.full_key, known)
-    return ConfigError(first)
+        further = None if arguments.config_dir is None else Path(arguments.config_dir)
+        with presets.composed(config_dir(), name, arguments.presets, further) as settings:
+            yield OmegaConf.merge(defaults, settings, arguments.given)

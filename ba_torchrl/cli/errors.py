@@ -8,13 +8,10 @@ import sys
 from collections.abc import Callable
 from typing import Any
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import DictConfig
 from omegaconf.errors import OmegaConfBaseException
 
 from ba_torchrl.cli import EXIT_CODE, plain_ends
-from ba_torchrl.core.errors import ConfigError, PartError, SettingsError, as_os_error
-from ba_torchrl.training import hydra_schema
+from ba_torchrl.core.errors import ConfigError, as_os_error
 
 _OF_RESOURCES = {
     *(errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.ESTALE),
@@ -60,20 +57,3 @@ def _text(error: Exception) -> str | None:
     if of_system is None or of_system.errno not in _OF_RESOURCES:
         return None
     return f"out of memory: {of_system}" if of_system.errno == errno.ENOMEM else str(of_system)
-
-
-def name_presets(error: ConfigError, settings: DictConfig) -> None:
-    """Let an error on an algorithm or a network have the names of presets, as the user wrote."""
-    choices = HydraConfig.get().runtime.choices
-    if not isinstance(error, PartError | SettingsError) or error.kind not in hydra_schema.GROUPS:
-        return
-    if error.kind in choices and settings[error.kind].get("name") == error.name:
-        error.name = choices[error.kind]
-    if isinstance(error, PartError):
-        error.instead = hydra_schema.presets_of(error.kind, error.instead)
-        return
-    fields = {field.split(".")[0] for field, _ in error.problems}
-    for group in ("replay", "rotation"):
-        if group in fields and choices.get(group) not in (None, "uniform", "none"):
-            hint = f"{group}={choices[group]} sets it; this algorithm cannot have it"
-            error.problems.append((group, hint))

@@ -9,19 +9,17 @@ import types
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Literal, Union, get_args, get_origin
 
-from hydra.core.hydra_config import HydraConfig
-from omegaconf import MISSING
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
-from ba_torchrl.core.config import parts_of
+from ba_torchrl.core.config import Part, defaults_of, parts_of
 from ba_torchrl.core.env_config import EnvConfig, env_config_model
+from ba_torchrl.core.registry import Registry
 from ba_torchrl.demonstrations.formats.base import FORMATS
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.sim.vision.camera_views import VIEWS
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training import hydra_schema
 
 CHOICES = {
     "format": FORMATS,
@@ -39,7 +37,6 @@ def describe(
     model: type[BaseModel],
     values: Mapping[str, Any],
     names: Sequence[str],
-    with_choices: bool,
 ) -> str:
     """Return the help of a command.
 
@@ -49,60 +46,58 @@ def describe(
         model: of its settings.
         values: its composed settings, unresolved; the presets among them decide which fields the
             parts of the settings have.
-        names: of its configuration files.
-        with_choices: whether the fields of the chosen algorithm, network, collector and launcher
-            are listed, whose models import torch.
+        names: of its configuration files, whose presets can be composed.
     """
     lines = [f"usage: {PROGRAM} {usage}", "", *text.strip().splitlines()]
+    registries: Mapping[str, Registry[Any]] = {}
     if names:
+        from hydra.core.hydra_config import HydraConfig
+
+        from ba_torchrl.training.presets import GROUPS, preset_names
+
+        registries = GROUPS
         lines += ["", f"--config-name: {' | '.join(names)}"]
         lines += ["--config-dir: a further folder of configurations"]
         lines += ["", "presets:"]
         for group in HydraConfig.get().runtime.choices:
             if "/" not in group:
-                lines += _wrapped(f"  {group}=", " | ".join(hydra_schema.preset_names(group)))
-    parts = list(_parts(model, values, with_choices))
+                lines += _wrapped(f"  {group}=", " | ".join(preset_names(group)))
+    parts = list(_parts(model, values, registries))
     expanded = {prefix for _, _, _, prefix in parts}
     for title, model, own, prefix in parts:
+        if not model.model_fields:
+            continue
         lines += ["", f"{title}:"]
         for name, field in model.model_fields.items():
             if (name in own or field.is_required()) and f"{prefix}{name}." not in expanded:
                 lines += _field(f"{prefix}{name}", field, own.get(name))
-    chosen = _chosen(values)
-    if chosen and not with_choices:
-        choices = HydraConfig.get().runtime.choices
-        words = " ".join(f"{group}={choices[group]}" for group in chosen)
-        lines += ["", f"fields of {', '.join(chosen)}: {PROGRAM} {usage.split()[0]} --help {words}"]
     return "\n".join(lines)
 
 
 def _parts(
-    settings: type[BaseModel], values: Mapping[str, Any], with_choices: bool
+    settings: type[BaseModel], values: Mapping[str, Any], registries: Mapping[str, Registry[Any]]
 ) -> Iterator[tuple[str, type[BaseModel], Mapping[str, Any], str]]:
     """Yield title, model, values and prefix of each part of the settings."""
     yield "settings", settings, values, ""
     if "env" in values:
         task = values.get("task")
-        known = isinstance(task, str) and task != MISSING
+        known = isinstance(task, str) and task in TASKS
         model = env_config_model(TASKS[task].Parameters) if known else EnvConfig
-        own = {**hydra_schema.defaults_of(model), **values["env"]}
+        own = {**defaults_of(model), **values["env"]}
         for name in {"seed", "expert"} - values["env"].keys():
             del own[name]
         yield f"env, the environment{f' of {task}' if known else ''}", model, own, "env."
-    for group in _chosen(values) if with_choices else ():
-        chosen, registry = values[group], hydra_schema.registries()[group]
-        if chosen["name"] in registry:
+    for group, registry in registries.items():
+        chosen = values.get(group) or {}
+        if chosen.get("name") in registry:
             model = registry[chosen["name"]]
-            yield f"{group}={chosen['name']}", model, chosen, f"{group}."
-
-
-def _chosen(values: Mapping[str, Any]) -> list[str]:
-    """Return the groups of presets from which the settings choose."""
-    return [group for group in hydra_schema.GROUPS if (values.get(group) or {}).get("name")]
+            yield f"{group}={chosen['name']}", model, {**defaults_of(model), **chosen}, f"{group}."
 
 
 def _field(name: str, field: FieldInfo, value: Any) -> list[str]:
     parts = parts_of(field.annotation)
+    if isinstance(field.default, Part) and isinstance(value, Mapping):
+        value = {"name": field.default.name, **value}
     if parts and isinstance(value, Mapping) and value.get("name", "") in parts:
         return _part(name, field, parts, value)
     shown = name
@@ -131,7 +126,7 @@ def _part(
     if chosen:
         lines = [f"  {name}.name={chosen}   {{{', '.join(parts)}}}"]
         lines += _description(field)
-    own = {**hydra_schema.defaults_of(parts[chosen]), **value}
+    own = {**defaults_of(parts[chosen]), **value}
     for each, inner in parts[chosen].model_fields.items():
         if each != "name":
             lines += _field(f"{name}.{each}", inner, own[each])
@@ -141,6 +136,7 @@ def _part(
 def _short(value: Any) -> str:
     if value is None:
         return "null"
+    value = list(value) if isinstance(value, tuple) else value
     text = str(value).lower() if isinstance(value, bool) else str(value).replace("'", "")
     return text if len(text) < 60 else f"{text[:57]}..."
 

@@ -16,7 +16,6 @@ import signal
 import sys
 from collections import Counter, defaultdict
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from statistics import fmean
 from typing import Any, NamedTuple
@@ -26,8 +25,8 @@ from pydantic import Field
 from ba_torchrl.cli.command import Arguments, Command
 from ba_torchrl.cli.types import TaskId, check_writable_folder
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.training import hydra_schema
-from ba_torchrl.training.config import ExperimentConfig, choose
+from ba_torchrl.training import presets
+from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import BenchmarkConfig, Status, plan, split, status
 
 
@@ -54,7 +53,7 @@ def parse(values: dict[str, Any], _: Arguments) -> Task:
     settings, common = split(values, Settings)
     if not settings.dry_run:
         check_writable_folder(settings.folder)
-    runs = plan(settings, common, hydra_schema.preset)
+    runs = plan(settings, common, presets.preset)
     if settings.only is not None and settings.only >= len(runs):
         raise ConfigError(f"only: must be a number from 0 to {len(runs) - 1}, got {settings.only}")
     return Task(settings, runs)
@@ -62,7 +61,7 @@ def parse(values: dict[str, Any], _: Arguments) -> Task:
 
 def main(task: Task) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
-    from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid
+    from ba_torchrl.training.grid.launchers.base import Grid
 
     config, runs, only = task.settings, task.runs, task.settings.only
     if only is not None and not config.dry_run:
@@ -73,7 +72,7 @@ def main(task: Task) -> None:
             print(f"{run.task:36} {run.label:20} seed {run.seed:<3} {state}")
         counts = Counter(state.state for _, state in states)
         print(f"{len(runs)} runs: {', '.join(f'{n} {state}' for state, n in counts.items())}")
-    launcher = choose(LAUNCHERS, config.launcher, "launcher")
+    launcher = config.launcher
     print_estimate(states, config.jobs if launcher.uses_jobs else 1)
     if config.dry_run:
         return
@@ -117,6 +116,4 @@ def print_estimate(states: Sequence[tuple[ExperimentConfig, Status]], at_once: i
         print(f"about {duration} for {runs} runs, {at_once} at a time, as finished ones took")
 
 
-COMMAND = Command(
-    main, Settings, config="benchmark", parse=parse, check=partial(split, model=Settings)
-)
+COMMAND = Command(main, Settings, config="benchmark", further=ExperimentConfig, parse=parse)

@@ -15,9 +15,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from hydra import compose
 from omegaconf import OmegaConf
 
+from ba_torchrl.cli import config_dir
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Folders, OutputFolder, PluginSettings, check_writable_folder
 from ba_torchrl.commands import benchmark as benchmark_command
@@ -26,7 +26,6 @@ from ba_torchrl.core.plugins import check_known
 from ba_torchrl.record.report import write_report
 from ba_torchrl.record.results import NON_LEARNING_FIELDS, RESULT_FILE, RunResult, differences
 from ba_torchrl.record.summary import Axis, Run, load_runs, sections
-from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.plan import expand, split
 
@@ -93,7 +92,7 @@ def completed(runs: Iterable[Run]) -> list[Run]:
 
 def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
     """Return the settings in which a run differs from the package's benchmark of its name."""
-    if run.benchmark not in hydra_schema.preset_names("benchmark"):
+    if not (config_dir() / "benchmark" / f"{run.benchmark}.yaml").exists():
         return {}
     planned = _planned(run.benchmark).get((run.task, run.label))
     if planned is None:
@@ -104,11 +103,13 @@ def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
 @functools.cache
 def _planned(benchmark: str) -> dict[tuple[str, str], ExperimentConfig]:
     """Return the runs of one of the package's benchmarks by task and label."""
-    hydra_schema.register()
-    overrides = [f"benchmark={benchmark}", f"name={benchmark}", "seeds=[0]"]
-    values = OmegaConf.to_container(compose("benchmark", overrides), resolve=True)
-    grid, common = split(values, benchmark_command.Settings)
-    return {(run.task, run.label): run for run in expand(grid, common, hydra_schema.preset)}
+    from ba_torchrl.training.presets import composed, preset
+
+    with composed(config_dir(), "benchmark", [f"benchmark={benchmark}"]) as settings:
+        own = {"name": benchmark, "seeds": [0]}
+        values = OmegaConf.to_container(OmegaConf.merge(settings, own), resolve=True)
+        grid, common = split(values, benchmark_command.Settings)
+        return {(run.task, run.label): run for run in expand(grid, common, preset)}
 
 
 COMMAND = Command(main, Settings, positional="runs")

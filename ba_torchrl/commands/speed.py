@@ -14,11 +14,11 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import Field
 
+from ba_torchrl.cli import config_dir
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text, as_list
 from ba_torchrl.envs.settings import check_env
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training import hydra_schema
 from ba_torchrl.training.config import ExperimentConfig
 
 LEARNERS = {"close_loop": ("sac", "equi_small"), "open_loop": ("spatial_q", "fcn")}
@@ -58,8 +58,10 @@ def main(settings: Settings) -> None:
     for task in settings.tasks:
         check_env(task, settings.env)  # before the import of torch
     from ba_torchrl.training.precision import compute_path
+    from ba_torchrl.training.presets import started
 
-    learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
+    with started(config_dir()):
+        learners = {task: list(learners_of(task, settings)) for task in settings.tasks}
     print(f"{'':52} {'per second':>10}")
     for task in settings.tasks:
         for name, num_envs, parallel in (
@@ -93,6 +95,8 @@ def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: boo
 
 def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
     """Yield the configuration of each learner that is measured on a task."""
+    from ba_torchrl.training.presets import preset
+
     algorithm, usual = LEARNERS[TASKS[task].control]
     for network in (settings.networks or [usual]) if settings.updates else ():
         values = settings.model_dump(include={"plugins", "env", "device", "seed"})
@@ -101,7 +105,7 @@ def learners_of(task: str, settings: Settings) -> Iterator[ExperimentConfig]:
                 **values,
                 "task": task,
                 "algorithm": {"name": algorithm},
-                "network": hydra_schema.preset("network", network),
+                "network": preset("network", network),
                 "label": f"{algorithm} {network}",
             }
         )

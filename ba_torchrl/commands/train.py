@@ -31,18 +31,19 @@ logger = logging.getLogger(__name__)
 
 def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
     """Return the run; that of an existing folder if the command line only resumes it."""
-    from ba_torchrl.training.checkpoint import read_config
-
     if values["resume"] is True:
+        from ba_torchrl.training.checkpoint import read_config  # imports torch, which takes seconds
+
         folder = expanded(values["run_dir"])
         exists = (Path(folder) / CONFIG_FILE).exists()
-        if arguments.config_name is None and arguments.names <= NON_LEARNING_FIELDS:
+        is_folder_alone = arguments.config_name is None and not arguments.presets
+        if is_folder_alone and arguments.names <= NON_LEARNING_FIELDS:
             if not exists:
                 raise ConfigError(f"there is no run in {folder} to resume")
             return read_config(folder, **{name: values[name] for name in arguments.names})
         if not exists:
             logger.warning("there is no run in %s to resume: a new one starts", folder)
-    return ExperimentConfig.parse(values, given=arguments.fields)
+    return ExperimentConfig.parse(values, given=arguments.names)
 
 
 def main(config: ExperimentConfig) -> None:
@@ -74,11 +75,4 @@ def main(config: ExperimentConfig) -> None:
     print("    env.rollout(env.max_steps, policy)")
 
 
-COMMAND = Command(
-    main,
-    ExperimentConfig,
-    config="train",
-    variants="quickstart*",
-    parse=parse,
-    check=ExperimentConfig.check_fields,
-)
+COMMAND = Command(main, ExperimentConfig, config="train", variants="quickstart*", parse=parse)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from numbers import Real
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar, get_args
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from pydantic import (
     AfterValidator,
@@ -15,12 +16,19 @@ from pydantic import (
     ConfigDict,
     Field,
     GetCoreSchemaHandler,
+    SerializationInfo,
     ValidationError,
+    model_validator,
 )
 from pydantic.fields import FieldInfo
 from pydantic_core import CoreSchema
+from pydantic_core.core_schema import (
+    no_info_plain_validator_function,
+    plain_serializer_function_ser_schema,
+)
 
 from ba_torchrl.core.errors import ConfigError, SettingsError, UnknownNameError
+from ba_torchrl.core.registry import Registry
 
 
 def numbers_of(values: Any, what: str, count: int = 2) -> tuple[float, ...]:
@@ -78,18 +86,47 @@ def expanded(path: str | Path) -> str:
     return found
 
 
-_EXPANDED = AfterValidator(expanded)
-LocalPath = Annotated[str, Field(min_length=1), _EXPANDED]
+LocalPath = Annotated[str, Field(min_length=1), AfterValidator(expanded)]
 """The type of every setting that is the path of a file or folder."""
 
 
-def takes_path(field: FieldInfo) -> bool:
-    """Whether a field is a path, or has paths."""
+def takes_text(field: FieldInfo) -> bool:
+    """Whether a field is a text, or texts, and nothing else but None."""
+    return {*_leaves(field.annotation)} <= {str, NoneType, list}
 
-    def mentions(annotation: Any) -> bool:
-        return annotation is _EXPANDED or any(map(mentions, get_args(annotation)))
 
-    return _EXPANDED in field.metadata or mentions(field.annotation)
+def takes_list(field: FieldInfo) -> bool:
+    """Whether a field can be a list."""
+    return list in _leaves(field.annotation)
+
+
+def _leaves(annotation: Any) -> Iterator[Any]:
+    """Yield the types of an annotation: of a list ``list``, then those of its items."""
+    origin, args = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        yield from _leaves(args[0])
+    elif origin in (list, Union, UnionType):
+        yield from [list] if origin is list else []
+        for each in args:
+            yield from _leaves(each)
+    else:
+        yield annotation
+
+
+def defaults_of(model: type[BaseModel]) -> dict[str, Any]:
+    """Return the fields of a model that have a default, as plain values: of a part that is chosen
+    by its name, those that differ from the choice's own defaults."""
+    return {
+        name: _plain(field.get_default(call_default_factory=True))
+        for name, field in model.model_fields.items()
+        if not field.is_required()
+    }
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Part):
+        return {"name": value.name, **value.model_dump(exclude_defaults=True)}
+    return value.model_dump() if isinstance(value, BaseModel) else value
 
 
 def explain(
@@ -103,6 +140,8 @@ def explain(
     arguments as for `parse`."""
     problems = []
     for item in error.errors():
+        if _is_inner(item):
+            continue
         names, owner, parts = _place(model, item["loc"])
         field, kind = ".".join(names) or "configuration", item["type"]
         if kind == "extra_forbidden":
@@ -122,9 +161,15 @@ def explain(
             if kind == "tuple_type":
                 message = "Input should be a list"
             given = repr(item["input"])
-            text = f"{field}: {message}" + (f" (got {given})" if len(given) < 80 else "")
+            is_short = names and len(given) < 80
+            text = f"{field}: {message}" + (f" (got {given})" if is_short else "")
         problems.append((field, text))
     return SettingsError(what, name, problems)
+
+
+def _is_inner(item: Mapping[str, Any]) -> bool:
+    """Whether one of pydantic's errors is an `InnerError`."""
+    return isinstance(item.get("ctx", {}).get("error"), InnerError)
 
 
 def _place(model: Any, loc: Iterable[Any]) -> tuple[list[str], Any, Mapping[str, Any]]:
@@ -168,7 +213,59 @@ def parse(
     try:
         return model.model_validate(values)
     except ValidationError as error:
+        inner = [item["ctx"]["error"] for item in error.errors() if _is_inner(item)]
+        if len(inner) == error.error_count():
+            raise inner[0].error from None
         raise explain(error, model, what, known, name) from None
+
+
+class InnerError(ValueError):
+    """An error of a part of settings, which `parse` raises as it is."""
+
+    def __init__(self, error: ConfigError) -> None:
+        self.error = error
+        super().__init__(error)
+
+
+def choose(registry: Registry[type[Model]], values: Mapping[str, Any]) -> Model:
+    """Return the registered model called ``values["name"]``, filled in.
+
+    Raises:
+        ConfigError: the name is missing or unknown, or a value cannot be used.
+    """
+    rest, kind = dict(values), registry.kind
+    name = rest.pop("name", None)
+    if name is None:
+        raise ConfigError(f"{kind}.name is missing; known: {', '.join(registry)}")
+    return parse(registry[name], rest, kind, name=name)
+
+
+class Chosen:
+    """Annotation of a field that has a model of a registry, which files and the command line have
+    as its ``name`` and its fields."""
+
+    def __init__(self, registry: Registry[Any]) -> None:
+        self.registry = registry
+
+    def __get_pydantic_core_schema__(self, *_: Any) -> CoreSchema:
+        written = plain_serializer_function_ser_schema(self.values, info_arg=True)
+        return no_info_plain_validator_function(self.model, serialization=written)
+
+    def model(self, values: Any) -> BaseModel:
+        """Return the model; `InnerError` if the values cannot be used."""
+        if isinstance(values, self.registry.base):
+            return values
+        if not isinstance(values, Mapping):
+            raise ValueError("Input should be a valid dictionary")
+        try:
+            return choose(self.registry, values)
+        except ConfigError as error:
+            raise InnerError(error) from None
+
+    def values(self, model: BaseModel, info: SerializationInfo) -> dict[str, Any]:
+        """Return the name and the fields of a model."""
+        name = self.registry.name_of(type(model))
+        return {"name": name, **model.model_dump(mode=info.mode)}
 
 
 def _take_any_sequence(schema: Any) -> None:
@@ -196,6 +293,25 @@ class StrictModel(BaseModel):
         allow_inf_nan=False,
         use_attribute_docstrings=True,  # the docstring below a field is its description
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_parts(cls, values: Any) -> Any:
+        """Name the parts that have values but no name: they are the defaults."""
+        if not isinstance(values, Mapping):
+            return values
+        fields = ((name, cls.model_fields.get(name)) for name in values)
+        names = {
+            name: field.default.name
+            for name, field in fields
+            if field is not None and isinstance(field.default, Part)
+        }
+        parts = {
+            name: {"name": default, **values[name]}
+            for name, default in names.items()
+            if isinstance(values[name], Mapping)
+        }
+        return {**values, **parts}
 
     @classmethod
     def __get_pydantic_core_schema__(

@@ -40,7 +40,7 @@ class UnknownNameError(ConfigError, KeyError):
         close = [each for each in self.known if word.search(each)][:3]
         close = close or self._nearest(last)
         meant = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
-        known = _LISTED_BY.get(self.kind, f"Known: {', '.join(self.known)}")
+        known = _LISTED_BY.get(self.kind, f"Known: {', '.join(self.known) or 'none'}")
         return f"unknown {self.kind} {self.name!r}.{meant} {known}{self.hint}"
 
     def _nearest(self, name: str) -> list[str]:

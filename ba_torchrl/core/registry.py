@@ -41,12 +41,14 @@ class Registry(Generic[T]):
         kind: what the entries are, in the singular, for error messages ("task").
         package: dotted name of the package whose modules hold the built-in entries.
         base: class of the entries, or from which they derive.
+        ending: of the names of the modules that hold the built-in entries; others are not imported.
     """
 
-    def __init__(self, kind: str, package: str, base: type = object) -> None:
+    def __init__(self, kind: str, package: str, base: type = object, ending: str = "") -> None:
         self.kind = kind
         self.package = package
         self.base = base
+        self.ending = ending
         self._entries: dict[str, T] = {}
         self._modules: dict[str, str] = {}
         self._is_scanned = False
@@ -90,12 +92,22 @@ class Registry(Generic[T]):
 
     def name_of(self, entry: T) -> str:
         """Return the name of an entry, for error messages; its own if it is not registered."""
-        known = (name for name in self if self._entries[name] is entry)
+        known = (
+            name
+            for name in self
+            if self._entries[name] is entry or _is_redefinition(self._entries[name], entry)
+        )
         return next(known, getattr(entry, "__name__", repr(entry)))
 
     def entry(self, name: str) -> T:
         """Return an entry; if it is registered, without the imports of the first look-up."""
         return self._entries[name] if name in self._entries else self[name]
+
+    def plugin_names(self) -> list[str]:
+        """Return the names that modules outside the package have registered, without the imports of
+        the first look-up."""
+        load_entry_points()
+        return sorted(name for name in self._entries if self.plugin_module(name) is not None)
 
     def plugin_module(self, name: str) -> str | None:
         """Return the module outside the package that registered a name; None if it is built in."""
@@ -131,7 +143,8 @@ class Registry(Generic[T]):
             return
         package = importlib.import_module(self.package)
         for module in pkgutil.walk_packages(package.__path__, prefix=f"{self.package}."):
-            importlib.import_module(module.name)
+            if module.name.endswith(self.ending):
+                importlib.import_module(module.name)
         load_entry_points()
         self._is_scanned = True
 

@@ -3,25 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
 
 import torch
 from tensordict import TensorDict, TensorDictBase
 from torch import Tensor
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.choices import Imitation
 from ba_torchrl.core.errors import check_choice
 
-Imitation = Literal["none", "executed", "expert", "expert_everywhere"]
-"""Which action an algorithm imitates, and on which transitions:
-
-- "none": no action. All transitions of a demonstration are one.
-- "executed": ``action``, on demonstrations, except where it is a random action.
-- "expert": ``target_action``, on demonstrations: the expert's action, or, in episodes without
-  ``expert_action``, as "executed".
-- "expert_everywhere": the same, and the expert's action in every state that the policy visits, in
-  which the environment then returns it.
-"""
 WITH_TARGET = frozenset({"expert", "expert_everywhere"})
 """Those for which the replay stores ``target_action``."""
 

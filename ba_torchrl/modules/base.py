@@ -1,20 +1,18 @@
-"""The interface of actor-critic networks, and the registry of networks."""
+"""The interface of actor-critic networks."""
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import NamedTuple
 
 from torch import nn
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.core.registry import Registry
+from ba_torchrl.modules.config import NETWORKS, NetworkConfig
 
-Control = Literal["open_loop", "close_loop"]
+__all__ = ["NETWORKS", "ActorCritic", "ActorCriticSpec", "NetworkConfig"]
 
 ACTION_LETTERS = "pxyzr"
 """Close-loop action components: p gripper, x y z displacement, r yaw."""
@@ -83,32 +81,3 @@ class ActorCritic(NamedTuple):
     critic: nn.Module
     """(features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the
     specification asks for K critics."""
-
-
-class NetworkConfig(StrictModel, ABC):
-    """A registered network: its hyper-parameters, and how it is built."""
-
-    control: ClassVar[Control]
-    """Control of the tasks that it supports. ``build`` returns an `ActorCritic` for close-loop
-    tasks and a `ba_torchrl.modules.spatial.base.SpatialQNetwork` for open-loop tasks."""
-    image_keys: ClassVar[tuple[str, ...]]
-    """Keys of its input images, in the order of its arguments; the holding flag follows."""
-    vector_keys: ClassVar[Sequence[str]]
-    """Keys of its input vectors, which follow the holding flag: a field, or of the class."""
-    shares_encoder: ClassVar[bool] = False
-    """Whether the policy sees features of the critics' encoder."""
-
-    @abstractmethod
-    def build(self, spec: Any) -> Any:
-        """Return freshly initialised modules.
-
-        Args:
-            spec: images and action, an `ActorCriticSpec` or a `SpatialSpec`.
-
-        Raises:
-            ValueError: the network does not support the size or kind of an image or the components
-                of the action, or they do not fit its hyper-parameters.
-        """
-
-
-NETWORKS: Registry[type[NetworkConfig]] = Registry("network", "ba_torchrl.modules", NetworkConfig)

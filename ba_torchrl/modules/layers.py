@@ -6,7 +6,7 @@ import contextlib
 import math
 from collections.abc import Callable, Iterator
 from functools import wraps
-from typing import Literal, TypeVar
+from typing import TypeVar
 
 import torch
 import torch.nn.functional as F
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
 from ba_torchrl.core import hardware
+from ba_torchrl.core.choices import Precision
 
 Value = TypeVar("Value")
 
@@ -94,9 +95,6 @@ def widened(value: Tensor) -> Tensor:
 def constants(values: tuple[float, ...], device: torch.device) -> Tensor:
     """Return numbers [n] in the widest floating type of a device; they are copied to it once."""
     return torch.tensor(values, dtype=widest_float(device), device=device)
-
-
-Precision = Literal["auto", "float32", "bfloat16"]
 
 
 @cached_constant()

@@ -16,18 +16,13 @@ from torchrl.objectives.utils import default_value_kwargs, dispatch_value_estima
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.choices import WeightedTerms, WeightNorm
 from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.networks import (
     EvalModeTargetsLoss,
     Reduction,
     checked_reduction,
 )
-
-WeightedTerms = Literal["none", "critic", "critic_and_policy", "all"]
-"""Terms of a loss that importance weights multiply: the error of the values; also the policy's
-objective; also the terms on demonstrations and the entropy temperature."""
-WeightNorm = Literal["max", "mean"]
-"""Normalisation of a batch's importance weights, see `TransitionLoss`."""
 
 
 class TransitionLoss(EvalModeTargetsLoss):

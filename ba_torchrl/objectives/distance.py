@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Literal
-
 import torch.nn.functional as F
 from torch import Tensor
 
-ActionDistance = Literal["mse", "kl"]
-"""Distance of a policy's action from the expert's: see `action_distance`."""
+from ba_torchrl.core.choices import ActionDistance
 
 
 def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance) -> Tensor:

@@ -15,8 +15,9 @@ from torchrl.modules import QValueActor
 from torchrl.objectives.sac import compute_rsample_log_prob
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.choices import ActionDistance
 from ba_torchrl.core.errors import check_choice
-from ba_torchrl.objectives.distance import ActionDistance, action_distance
+from ba_torchrl.objectives.distance import action_distance
 from ba_torchrl.objectives.dqn import LevelValues, as_levels
 from ba_torchrl.objectives.networks import (
     EvalModeTargetsLoss,

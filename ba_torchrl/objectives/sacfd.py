@@ -19,9 +19,10 @@ from torchrl.objectives.sac import compute_rsample_log_prob
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.choices import ActionDistance
 from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.base import TransitionLoss
-from ba_torchrl.objectives.distance import ActionDistance, action_distance
+from ba_torchrl.objectives.distance import action_distance
 
 
 class SACfDLoss(TransitionLoss):

@@ -14,7 +14,6 @@ from torchrl.envs import EnvBase
 from ba_torchrl import make_vector_env
 from ba_torchrl.algorithms.base import Learner, SeedUse
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
 from ba_torchrl.demonstrations.demo_files import load_demonstrations
 from ba_torchrl.demonstrations.episodes import is_success
@@ -55,7 +54,7 @@ def start_collection(
         make_policy=partial(_make_policy, values),
         workers=config.workers,
     )
-    return config.collector_config.start(problem, positions)
+    return config.collector.start(problem, positions)
 
 
 def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: int) -> EnvBase:
@@ -71,7 +70,6 @@ def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:
 
 
 def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
-    load_plugins(values["plugins"])
     return ExperimentConfig.model_validate({**values, **changes})
 
 

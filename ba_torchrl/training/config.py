@@ -6,17 +6,20 @@ seconds; methods import what needs it.
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field
+from pydantic import Field, field_validator
 
+from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS, LearnerConfig, NetworkConfig
 from ba_torchrl.core.config import (
     MAX_SEED,
+    Chosen,
     CompileMode,
+    InnerError,
     LocalPath,
     Source,
     WorkerOptions,
@@ -25,15 +28,14 @@ from ba_torchrl.core.config import (
 )
 from ba_torchrl.core.errors import ConfigError, PartError, install_command
 from ba_torchrl.core.plugins import MAIN, load_plugins
+from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
 from ba_torchrl.record.logging import Backend
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
+from ba_torchrl.training.collectors.config import COLLECTORS, CollectorConfig
 
 if TYPE_CHECKING:
     import torch
-
-    from ba_torchrl.algorithms.base import LearnerConfig, NetworkConfig, SeedUse
-    from ba_torchrl.training.collectors.base import CollectorConfig
 
 SET_BY_THE_EXPERIMENT = ("seed", "expert")
 """Fields of `EnvConfig` that are not for the user to set."""
@@ -53,9 +55,9 @@ class ExperimentConfig(WorkerOptions):
     """Id of the task."""
     env: dict[str, Any] = Field(default_factory=dict)
     """Fields of `EnvConfig`."""
-    algorithm: dict[str, Any]
+    algorithm: Annotated[LearnerConfig, Chosen(ALGORITHMS)]
     """``name`` of a registered algorithm and its hyper-parameters."""
-    network: dict[str, Any]
+    network: Annotated[NetworkConfig, Chosen(NETWORKS)]
     """``name`` of a registered network and its hyper-parameters."""
     seed: int = Field(default=0, ge=0, le=MAX_SEED)
     """Seed of networks, environments, replay and augmentation."""
@@ -77,7 +79,9 @@ class ExperimentConfig(WorkerOptions):
     processes where at least three can run at a time."""
     wait_for_restarts: bool = False
     """In collection; evaluations wait. See `WorkerOptions` for the fields of processes."""
-    collector: dict[str, Any] = Field(default_factory=lambda: {"name": "single"})
+    collector: Annotated[CollectorConfig, Chosen(COLLECTORS)] = Field(
+        default={"name": "single"}, validate_default=True
+    )
     """``name`` of a registered collector and its options: where the policy collects."""
     demonstrations: int = Field(default=100, ge=0)
     """Expert episodes in the replay before the first update; reference implementation."""
@@ -150,27 +154,6 @@ class ExperimentConfig(WorkerOptions):
         """How the processes of environments start and are replaced."""
         return WorkerOptions(**{name: getattr(self, name) for name in WorkerOptions.model_fields})
 
-    @cached_property
-    def network_config(self) -> NetworkConfig:
-        """The network's hyper-parameters."""
-        from ba_torchrl.algorithms.base import NETWORKS
-
-        return choose(NETWORKS, self.network, "network")
-
-    @cached_property
-    def algorithm_config(self) -> LearnerConfig:
-        """The algorithm's hyper-parameters."""
-        from ba_torchrl.algorithms.base import ALGORITHMS
-
-        return choose(ALGORITHMS, self.algorithm, "algorithm")
-
-    @cached_property
-    def collector_config(self) -> CollectorConfig:
-        """The collector's options."""
-        from ba_torchrl.training.collectors.base import COLLECTORS
-
-        return choose(COLLECTORS, self.collector, "collector")
-
     def derived_seed(self, use: SeedUse, part: int = 0) -> int:
         """Return the first seed of the environments that serve ``use``.
 
@@ -178,32 +161,15 @@ class ExperimentConfig(WorkerOptions):
             use: what the environments serve.
             part: number of a further set of episodes for the same use, after a resumption.
         """
-        from ba_torchrl.algorithms.base import derive_seed
-
         return derive_seed(self.seed, use, part)
 
     def resolved(self) -> dict[str, Any]:
-        """Return the configuration as JSON, every default filled in."""
-        return {
-            **self.model_dump(mode="json"),
-            "env": self.resolved_env.config.model_dump(
-                mode="json", exclude=set(SET_BY_THE_EXPERIMENT)
-            ),
-            "algorithm": {
-                "name": self.algorithm["name"],
-                **self.algorithm_config.model_dump(mode="json"),
-            },
-            "network": {
-                "name": self.network["name"],
-                **self.network_config.model_dump(mode="json"),
-            },
-            "collector": {
-                "name": self.collector["name"],
-                **self.collector_config.model_dump(
-                    mode="json", exclude=set(self.collector_config.resources)
-                ),
-            },
-        }
+        """Return what determines the run as JSON: every default of the task filled in, without the
+        resources of the collector."""
+        values, unset = self.model_dump(mode="json"), set(SET_BY_THE_EXPERIMENT)
+        for name in self.collector.resources:
+            values["collector"].pop(name, None)
+        return {**values, "env": self.resolved_env.config.model_dump(mode="json", exclude=unset)}
 
     @property
     def torch_device(self) -> torch.device:
@@ -229,13 +195,18 @@ class ExperimentConfig(WorkerOptions):
         Raises:
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
-        config = cls.check_fields(values, what)._without_replaced(given)
+        config = parse(cls, _without_replaced(values, given), what)
+        for reserved in SET_BY_THE_EXPERIMENT:
+            if reserved in config.env:
+                raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
+        check_env(config.task, config.env, "env")
+        config.collector.check(config.num_envs)
         if config.resolved_env.config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
-        control = config.resolved_env.task_class.control
-        config.algorithm_config.check(config.network_config, control)
+        algorithm = config.algorithm
+        algorithm.check(config.network, config.resolved_env.task_class.control)
         config._check_reward()
-        own, further = config.algorithm_config.first_updates, config.pretrain_updates
+        own, further = algorithm.first_updates, config.pretrain_updates
         total = config.total_updates
         offline = max(own, total) if further == total else own + further
         if offline > total:
@@ -246,19 +217,18 @@ class ExperimentConfig(WorkerOptions):
             )
         if offline and not config.demonstrations:
             raise ConfigError("an update before the first environment step needs demonstrations")
-        if not config.algorithm_config.collects and not config.demonstrations:
+        if not algorithm.collects and not config.demonstrations:
             why = "learns from demonstrations only; set demonstrations"
-            raise PartError("algorithm", config.algorithm["name"], why)
-        capacity = config.algorithm_config.replay.capacity
+            raise PartError("algorithm", ALGORITHMS.name_of(type(algorithm)), why)
+        capacity = algorithm.replay.capacity
         if config.min_replay > capacity:
             raise ConfigError(
                 f"min_replay: {config.min_replay} transitions are more than the replay holds "
                 f"({capacity}); the run would never start to learn"
             )
-        config.collector_config.check(config.num_envs)
-        if config.compile_mode is not None and not config.algorithm_config.is_compilable:
+        if config.compile_mode is not None and not algorithm.is_compilable:
             why = "cannot be compiled; leave out compile_mode"
-            raise PartError("algorithm", config.algorithm["name"], why)
+            raise PartError("algorithm", ALGORITHMS.name_of(type(algorithm)), why)
         config._check_demonstrations()
         if config.logger != "csv" and find_spec(config.logger) is None:
             raise ConfigError(
@@ -268,45 +238,32 @@ class ExperimentConfig(WorkerOptions):
         usable_device(config.device)
         return config.model_copy(update={"plugins": config._all_plugins()})
 
+    @field_validator("plugins")
     @classmethod
-    def check_fields(cls, values: dict[str, Any], what: str = "experiment") -> ExperimentConfig:
-        """Validate everything that needs no torch: the fields, and those of the environment."""
-        config = parse(cls, values, what)
-        load_plugins(config.plugins)
-        for reserved in SET_BY_THE_EXPERIMENT:
-            if reserved in config.env:
-                raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
-        check_env(config.task, config.env, "env")
-        return config
-
-    def _without_replaced(self, given: Collection[str]) -> ExperimentConfig:
-        changes = {}
-        for kind, registry in _registries().items():
-            values = getattr(self, kind)
-            below = [name.removeprefix(f"{kind}.") for name in given if name.startswith(f"{kind}.")]
-            if below and "name" in values:
-                changes[kind] = without_replaced(registry[values["name"]], values, below)
-        return self.model_copy(update=changes)
+    def _load(cls, names: list[str]) -> list[str]:
+        try:
+            load_plugins(names)
+        except ConfigError as error:
+            raise InnerError(error) from error
+        return names
 
     def _all_plugins(self) -> list[str]:
         """Return `plugins` and the modules that register what the run uses, each once."""
         modules = (
-            registry.plugin_module(getattr(self, kind)["name"])
-            for kind, registry in _registries().items()
+            registry.plugin_module(registry.name_of(type(getattr(self, kind))))
+            for kind, registry in _REGISTRIES.items()
         )
         found = [name for name in modules if name is not None and name not in MAIN]
         return list(dict.fromkeys([*self.resolved_env.modules, *found]))
 
     def _check_reward(self) -> None:
-        env, gamma = self.resolved_env.config, getattr(self.algorithm_config, "gamma", None)
+        env, gamma = self.resolved_env.config, getattr(self.algorithm, "gamma", None)
         if env.reward == "difference" and gamma not in (None, env.reward_discount):
             raise ConfigError(
                 f"env.reward_discount: {env.reward_discount:g} must equal algorithm.gamma, "
                 f"{gamma:g}; otherwise the difference changes which policy is optimal"
             )
-        if env.reward == "dense" and not getattr(
-            self.algorithm_config, "bootstrap_truncated", True
-        ):
+        if env.reward == "dense" and not getattr(self.algorithm, "bootstrap_truncated", True):
             raise ConfigError(
                 "env.reward: with 'dense', success is truncated and needs "
                 "algorithm.bootstrap_truncated=true"
@@ -361,21 +318,16 @@ def _as_device(name: str) -> torch.device:
     return torch.device(name)
 
 
-def _registries() -> dict[str, Any]:
-    """Return the registry of each field that is chosen from one."""
-    from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
-    from ba_torchrl.training.collectors.base import COLLECTORS
-
-    return {"network": NETWORKS, "algorithm": ALGORITHMS, "collector": COLLECTORS}
+_REGISTRIES = {"network": NETWORKS, "algorithm": ALGORITHMS, "collector": COLLECTORS}
+"""Registry of each field that is chosen from one."""
 
 
-def choose(registry: Any, values: dict[str, Any], kind: str) -> Any:
-    """Return the registered configuration class called ``values["name"]``, filled in.
-
-    ``kind`` says what is chosen, for the `ConfigError` of unknown names and values.
-    """
-    rest = dict(values)
-    name = rest.pop("name", None)
-    if name is None:
-        raise ConfigError(f"{kind}.name is missing; known: {', '.join(registry)}")
-    return parse(registry[name], rest, kind, name=name)
+def _without_replaced(values: Mapping[str, Any], given: Collection[str]) -> dict[str, Any]:
+    """Return values without those of parts that given ones replace."""
+    out = dict(values)
+    for kind, registry in _REGISTRIES.items():
+        below = [name.removeprefix(f"{kind}.") for name in given if name.startswith(f"{kind}.")]
+        name = out[kind].get("name") if below and isinstance(out.get(kind), Mapping) else None
+        if name is not None and name in registry:
+            out[kind] = without_replaced(registry[name], out[kind], below)
+    return out

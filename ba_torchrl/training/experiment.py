@@ -179,8 +179,8 @@ class Experiment:
         computed = precision(config)
         if computed not in self.state.precisions:
             self.state.precisions.append(computed)
-        first = config.algorithm_config.first_updates
-        collects = config.algorithm_config.collects
+        first = config.algorithm.first_updates
+        collects = config.algorithm.collects
         offline = first + config.pretrain_updates if collects else config.total_updates
         self._phase_start = learner.updates
         with self._phase("pretraining"):

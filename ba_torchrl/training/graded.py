@@ -19,7 +19,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.algorithms.base import Learner, SeedUse, derive_seed
+from ba_torchrl.algorithms.base import NETWORKS, Learner, SeedUse, derive_seed
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import atomic_output
@@ -251,7 +251,8 @@ def half_trained(
         rate = evaluate(env, policy, _SELECTION_EPISODES, seed).success_rate
         logger.info("%s, medium: success %.2f after %d updates", sets.task, rate, learner.updates)
         if least <= rate <= most:
-            text = f"bc {config.network['name']}, {len(demonstrations)} episodes of the expert, "
+            name = NETWORKS.name_of(type(config.network))
+            text = f"bc {name}, {len(demonstrations)} episodes of the expert, "
             text += f"{learner.updates} updates, success {rate:.2f} of {_SELECTION_EPISODES}"
             return policy, text
         if rate > most:

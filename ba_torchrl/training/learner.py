@@ -29,7 +29,7 @@ def _build(config: ExperimentConfig, problem: Problem) -> Learner:
     dtype = torch.get_default_dtype()
     torch.set_default_dtype(torch.float32)  # of the observations; escnn works in no other
     try:
-        return config.algorithm_config.build(config.network_config, problem)
+        return config.algorithm.build(config.network, problem)
     except ConfigError:
         raise
     except ValueError as error:  # sizes and components that a network does not take

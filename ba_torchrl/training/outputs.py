@@ -118,7 +118,7 @@ def expert_version(config: ExperimentConfig) -> int | None:
     None if there is none, and of demonstrations that do not name it.
     """
     present = config.resolved_env.task_class.expert_version
-    if config.algorithm_config.imitates == "expert_everywhere":
+    if config.algorithm.imitates == "expert_everywhere":
         return present
     if config.demonstrations and config.demonstrations_path is not None:
         return recorded_expert(config.demonstrations_path, config.demonstrations_mapping)

@@ -12,7 +12,7 @@ from ba_torchrl.training.config import ExperimentConfig
 def precision(config: ExperimentConfig) -> str:
     """Return the number format in which a run's networks compute on its device."""
     device = config.torch_device
-    found = str(network_dtype(config.network_config, device)).removeprefix("torch.")
+    found = str(network_dtype(config.network, device)).removeprefix("torch.")
     if found != "float32" or device.type != "cuda" or not torch.backends.cudnn.allow_tf32:
         return found
     return "tf32" if torch.cuda.get_device_capability(device)[0] >= 8 else found

@@ -200,7 +200,7 @@ def measure_update(bench: Bench, update: Update) -> list[Row]:
     """Return the row of a learner's updates."""
     config = _config(bench, update.experiment, update.network, update.obs_size)
     learner = make_learner(bench, update.experiment, update.network, update.obs_size)
-    dtype = network_dtype(config.network_config, bench.device)
+    dtype = network_dtype(config.network, bench.device)
     product = MatrixProduct(dtype, bench.device)
     multiply_adds = count_multiply_adds(learner.update)
     if bench.compile_mode is not None:  # after the count, in which nothing is compiled

@@ -8,7 +8,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hydra import initialize_config_dir
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.base import ALGORITHMS, NETWORKS
@@ -19,7 +18,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
 from ba_torchrl.data.augmentation.views import RandomViews
 from ba_torchrl.objectives.sacfd import SoftUpdateByNetwork
-from ba_torchrl.training import hydra_schema
+from ba_torchrl.training.presets import preset, started
 from tests.algorithms import tiny
 from tests.specs import close_loop_images
 
@@ -32,9 +31,8 @@ IMAGE, CROP = 71, 64
 @cache
 def method(name):
     """The values of a method, composed of presets."""
-    hydra_schema.register()
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        return hydra_schema.preset("algorithm", name)
+    with started(CONFIGS):
+        return preset("algorithm", name)
 
 
 PAIRS = {
@@ -61,7 +59,7 @@ PRESETS = sorted(path.stem for path in (CONFIGS / "algorithm").glob("*.yaml"))
 def build(preset, network, first=0, **changes):
     """A learner; of FERM, with some first updates of the contrastive loss alone."""
     values = {**method(preset), **changes, "batch_size": 4}
-    values["replay"] = {**values["replay"], "capacity": 60}
+    values["replay"] = {**values.get("replay", {}), "capacity": 60}
     sequence = tiny.SIX_DOF if network == "6d_asr" else None
     network = network.removeprefix("6d_")
     problem = tiny.problem(network, sequence)
@@ -300,7 +298,7 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
     ("changes", "message"),
     [
         ({"contrastive": {"name": "info_nce"}}, "compares views: set views.name"),
-        ({"views": {"pixels": 2}}, "views.name is missing; known: none, crop, shift"),
+        ({"views": {"pixels": 2}}, r"'views.pixels'. Known: name \(views.name=shift has it\)"),
         ({"views": {"name": "shft"}}, "unknown views.name 'shft'. Did you mean 'shift'"),
         (
             {"views": {"name": "crop", "pixels": 2}},

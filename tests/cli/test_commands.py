@@ -19,7 +19,7 @@ import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE, types
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.cli.types import check_writable_file
-from ba_torchrl.core.config import StrictModel, parse, takes_path
+from ba_torchrl.core.config import StrictModel, expanded, parse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import atomic_output
 from tests.recipes import load_recipe, recipe
@@ -140,7 +140,7 @@ def test_types_of_settings(kind, right, wrong, monkeypatch, tmp_path):
 
 
 NO_PATHS = {
-    *("Source.source", "RunResult.policy_file"),
+    *("EntrySource.source", "RunResult.policy_file"),
     *("BenchmarkConfig.algorithms", "BenchmarkConfig.networks"),
 }
 """Fields whose descriptions speak of files: names in them, names of presets, checksums."""
@@ -162,6 +162,16 @@ def has_text(annotation):
     is_mapping = get_origin(annotation) is dict
     parts = () if is_mapping else get_args(annotation)
     return annotation in (str, Path) or any(map(has_text, parts))
+
+
+def takes_path(field):
+    """Whether a field is a path, or has paths."""
+
+    def mentions(annotation):
+        is_path = getattr(annotation, "func", None) is expanded
+        return is_path or any(map(mentions, get_args(annotation)))
+
+    return any(map(mentions, [*field.metadata, field.annotation]))
 
 
 def test_every_path_among_the_settings_has_the_type_of_paths():

@@ -22,8 +22,7 @@ def test_without_a_writable_folder_functions_are_compiled_after_one_warning(monk
     monkeypatch.setattr(caching.CacheImpl, "_locator_classes", [])
     jit._warn_once.cache_clear()
     with pytest.warns(UserWarning, match="NUMBA_CACHE_DIR"):
-        compiled = jit.njit(nogil=True)(twice)
-    assert compiled(21) == 42
+        assert jit.njit(nogil=True)(twice)(21) == 42
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert jit.njit()(twice)(4) == 8
@@ -35,7 +34,7 @@ def test_other_errors_of_the_compiler_are_raised(monkeypatch):
 
     monkeypatch.setattr(numba, "njit", fail)
     with pytest.raises(RuntimeError, match="no compiler"):
-        jit.njit()(twice)
+        jit.njit()(twice)(21)
 
 
 def test_all_functions_are_compiled_by_this_decorator():

@@ -39,6 +39,6 @@ def test_overriding_one_method_replaces_one_part(additions, tmp_path):
             return [SO2Augmentation(self.images, self.problem.actions.sequence, seed=0)]
 
     config = make_experiment(tmp_path, "cnn", BATCH).config
-    learner = Augmented(config.algorithm_config, config.network_config, problem_of(config))
+    learner = Augmented(config.algorithm, config.network, problem_of(config))
     assert isinstance(learner.replay.transform[0], SO2Augmentation)
     assert learner.target_updater is None

@@ -10,6 +10,7 @@ import torch.nn.functional as F
 pytest.importorskip("escnn")
 
 from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.spatial.base import scaled_heights, scaled_in_hand
 from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
 from tests.modules.networks import COUNTS, POSE, count
@@ -189,11 +190,11 @@ def test_heights_of_later_levels_are_in_voxels():
     """The value of a scale of voxels changes projections and patches alike."""
     config = NETWORKS["asr"](voxel_scale=10.0, height_scale_m=0.05, precision="float32")
     heights, counts = torch.full((1, 1, 2, 2), 0.03), torch.full((1, 3, 2, 2), 6.0)
-    assert config.heights(heights).unique().item() == pytest.approx(0.6)
+    assert scaled_heights(config, heights).unique().item() == pytest.approx(0.6)
     in_voxels = config.in_voxels(0.005)
-    assert in_voxels.heights(heights).unique().item() == pytest.approx(0.6)  # 6 voxels
-    assert in_voxels.in_hand(counts).unique().item() == pytest.approx(0.6)
-    assert config.in_voxels(0.00625).heights(heights).unique().item() == pytest.approx(0.48)
+    assert scaled_heights(in_voxels, heights).unique().item() == pytest.approx(0.6)  # 6 voxels
+    assert scaled_in_hand(in_voxels, counts).unique().item() == pytest.approx(0.6)
+    assert scaled_heights(config.in_voxels(0.00625), heights).unique().item() == pytest.approx(0.48)
 
 
 def test_sizes_that_do_not_fit_are_refused():

@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
-import torch
 from pydantic import Field
-from torch import nn
 
 from ba_torchrl.core.config import Part
-from ba_torchrl.core.evaluation_mode import evaluation_copy
-from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.objectives.sacfd import BilinearInfoNCE
+
+if TYPE_CHECKING:
+    from torch import nn
+
+    from ba_torchrl.core.images import ImageSpec
+    from ba_torchrl.objectives.sacfd import BilinearInfoNCE
 
 
 class NoContrastive(Part):
@@ -43,6 +44,11 @@ class InfoNCE(Part):
             encoder: of the features.
             images: declarations of its images.
         """
+        import torch
+
+        from ba_torchrl.core.evaluation_mode import evaluation_copy
+        from ba_torchrl.objectives.sacfd import BilinearInfoNCE
+
         device = next(encoder.parameters()).device
         zeros = [torch.zeros(image.shape, device=device) for image in images.values()]
         with torch.no_grad():  # without vectors, which are not compared

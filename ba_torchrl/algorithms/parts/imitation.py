@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
+from ba_torchrl.core.choices import ActionDistance
 from ba_torchrl.core.config import Part
-from ba_torchrl.demonstrations.episodes import EpisodeAssembler
-from ba_torchrl.objectives.distance import ActionDistance
+
+if TYPE_CHECKING:
+    from ba_torchrl.demonstrations.episodes import EpisodeAssembler
 
 
 class _Behaviour(Part):
@@ -53,6 +55,8 @@ class Successes(Demonstrations):
 
     def build(self) -> EpisodeAssembler:
         """Return what assembles collected episodes before they are stored."""
+        from ba_torchrl.demonstrations.episodes import EpisodeAssembler
+
         return EpisodeAssembler()
 
 

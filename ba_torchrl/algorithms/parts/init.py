@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 
 from pydantic import Field
-from tensordict.nn import ProbabilisticTensorDictSequential
-from torchrl.objectives import LossModule
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import Part
-from ba_torchrl.objectives.imitation import BehaviourCloningLoss
+
+if TYPE_CHECKING:
+    from tensordict.nn import ProbabilisticTensorDictSequential
+    from torchrl.objectives import LossModule
 
 
 class RandomInit(Part):
@@ -38,6 +39,8 @@ class Cloning(Part):
 
     def build(self, policy: ProbabilisticTensorDictSequential) -> list[tuple[int, LossModule]]:
         """Return the number of updates and their loss."""
+        from ba_torchrl.objectives.imitation import BehaviourCloningLoss
+
         loss = BehaviourCloningLoss(policy, "kl", self.entropy_weight)
         loss.set_keys(action=keys.TARGET_ACTION)
         loss.loss_mask_key = keys.IS_DEMONSTRATION

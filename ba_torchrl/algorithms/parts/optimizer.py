@@ -3,40 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import TYPE_CHECKING
 
-import torch
 from pydantic import Field
-from torch import nn
-from torch.optim import Adam, Optimizer
-from torch.optim.lr_scheduler import LinearLR
-from torch.optim.swa_utils import AveragedModel, get_ema_multi_avg_fn
 
 from ba_torchrl.core.config import StrictModel
 
+if TYPE_CHECKING:
+    from torch import nn
+    from torch.optim import Adam, Optimizer
+    from torch.optim.lr_scheduler import LinearLR
 
-class PolicyAverage(AveragedModel):
-    """The exponential moving average of a policy's parameters and floating-point buffers.
-
-    Args:
-        policy: of which it begins as a copy.
-        decay: of the average, at each update.
-    """
-
-    def __init__(self, policy: nn.Module, decay: float) -> None:
-        super().__init__(policy, multi_avg_fn=get_ema_multi_avg_fn(decay))
-        self.decay = decay
-
-    @torch.no_grad()
-    def update_parameters(self, model: nn.Module) -> None:
-        """Move the average towards a policy of the same structure; the first update copies it."""
-        averages = [(each, each.clone()) for each in self.module.buffers()]
-        is_first = bool(self.n_averaged == 0)
-        super().update_parameters(model)  # which copies buffers
-        for buffer, before in averages:
-            if buffer.is_floating_point() and not is_first:
-                # an equal element stays, since the average of infinities is not a number
-                moved = torch.lerp(before, buffer, 1 - self.decay)
-                buffer.copy_(torch.where(before == buffer, buffer, moved))
+    from ba_torchrl.algorithms.parts.policy_average import PolicyAverage
 
 
 class OptimizerConfig(StrictModel):
@@ -66,6 +44,8 @@ class OptimizerConfig(StrictModel):
             networks: parameters to which weight decay applies, if they are among them.
             factor: on the learning rate.
         """
+        from torch.optim import Adam
+
         others = {id(parameter): parameter for parameter in parameters}
         decayed = [p for p in networks if others.pop(id(p), None) is not None]
         groups = [
@@ -77,11 +57,15 @@ class OptimizerConfig(StrictModel):
 
     def schedule(self, optimizer: Optimizer, steps: int) -> LinearLR:
         """Return the schedule of an optimiser's learning rate over a number of steps."""
+        from torch.optim.lr_scheduler import LinearLR
+
         end = self.learning_rate_end_factor
         return LinearLR(optimizer, start_factor=1.0, end_factor=end, total_iters=steps)
 
     def average(self, policy: nn.Module) -> PolicyAverage | None:
         """Return the moving average of a policy, if configured."""
+        from ba_torchrl.algorithms.parts.policy_average import PolicyAverage
+
         if not self.policy_average:
             return None
         return PolicyAverage(policy, self.policy_average)

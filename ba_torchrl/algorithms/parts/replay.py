@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
-import torch
 from pydantic import Field
 
+from ba_torchrl.core.choices import WeightedTerms, WeightNorm
 from ba_torchrl.core.config import Part
-from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.replay.buffer import FrameReplayBuffer
-from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
-from ba_torchrl.data.replay.make import make_replay
-from ba_torchrl.objectives.base import WeightedTerms, WeightNorm
+
+if TYPE_CHECKING:
+    import torch
+
+    from ba_torchrl.core.images import ImageSpec
+    from ba_torchrl.data.replay.buffer import FrameReplayBuffer
 
 
 class _Replay(Part):
@@ -39,6 +40,9 @@ class _Replay(Part):
             seed: of the draws.
             device: of the images; the codes are copied to it.
         """
+        from ba_torchrl.data.replay.codecs import ImageCodecs, make_codecs
+        from ba_torchrl.data.replay.make import make_replay
+
         own = self.model_dump(exclude={"name", "capacity", *self.loss_options})
         own |= {"codecs": make_codecs(images), "returns_codes": device.type != "cpu", "seed": seed}
         replay = make_replay(self.name, self.capacity, batch_size, **own)

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
-from torchrl.envs import Transform
 
-from ba_torchrl.algorithms.problem import Problem, SeedUse
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import Part
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.augmentation.rigid import RigidAugmentation
-from ba_torchrl.data.augmentation.so2 import SO2Augmentation, StoredCopies
-from ba_torchrl.modules.spatial.policy import SpatialActions
+from ba_torchrl.core.seeds import SeedUse
+
+if TYPE_CHECKING:
+    from torchrl.envs import Transform
+
+    from ba_torchrl.algorithms.problem import Problem
+    from ba_torchrl.core.images import ImageSpec
+    from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+    from ba_torchrl.modules.spatial.policy import SpatialActions
 
 
 class NoRotation(Part):
@@ -51,6 +54,8 @@ class Stored(Part):
 
     def build(self, *args: Any) -> list[Transform]:
         """Return the transform of a replay; arguments as for `_so2`."""
+        from ba_torchrl.data.augmentation.so2 import StoredCopies
+
         return [StoredCopies(_so2(*args, SeedUse.STORED_AUGMENTATION, 1.0), self.copies)]
 
 
@@ -67,6 +72,8 @@ def _so2(
         ConfigError: the network has vectors, which are not rotated.
         ValueError: an image cannot be rotated.
     """
+    from ba_torchrl.data.augmentation.so2 import SO2Augmentation
+
     if vectors:
         raise ConfigError(
             f"rotation turns images and actions, but not the network's vectors "
@@ -99,6 +106,8 @@ class Rigid(Part):
         Raises:
             ValueError: images or actions of the task cannot be transformed.
         """
+        from ba_torchrl.data.augmentation.rigid import RigidAugmentation
+
         options = self.model_dump(exclude={"name"})
         options |= {"seed": problem.derived_seed(SeedUse.AUGMENTATION), "action_key": action_key}
         return [RigidAugmentation(self.name, problem.actions, images, grid=grid, **options)]

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
-from torchrl.envs import Transform
 
 from ba_torchrl.core.config import Part
-from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.augmentation.views import CenterCrop, RandomViews, cropped_images
+
+if TYPE_CHECKING:
+    from torchrl.envs import Transform
+
+    from ba_torchrl.core.images import ImageSpec
 
 
 class _Whole(Part):
@@ -49,6 +51,8 @@ class _Random(_Whole):
 
     def build(self, *args: Any, **options: Any) -> list[Transform]:
         """Return the transform of sampled transitions; arguments as for `RandomViews`."""
+        from ba_torchrl.data.augmentation.views import RandomViews
+
         return [RandomViews(*args, **self.loss_options, **options)]
 
 
@@ -62,10 +66,14 @@ class Crop(_Random):
     def seen(self, images: Mapping[str, ImageSpec]) -> dict[str, ImageSpec]:
         """Return the declarations of the crops; `ConfigError` if an image is not larger than its
         crop."""
+        from ba_torchrl.data.augmentation.views import cropped_images
+
         return cropped_images(images, self.size)
 
     def acting(self, images: Iterable[str]) -> list[Transform]:
         """Return the transform to the centre."""
+        from ba_torchrl.data.augmentation.views import CenterCrop
+
         return [CenterCrop(self.size, list(images))]
 
     def build(self, *args: Any, **options: Any) -> list[Transform]:

@@ -6,17 +6,13 @@ import itertools
 from collections.abc import Iterable, Sequence
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
+from ba_torchrl.modules.actor_critic.cnn_config import CNNConfig
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
-from ba_torchrl.modules.actor_critic.trunk import (
-    ImageNetworkConfig,
-    ImageTrunk,
-    scale_from_log_std,
-    trunk_stages,
-)
-from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
+from ba_torchrl.modules.actor_critic.trunk import ImageTrunk, scale_from_log_std, trunk_stages
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 128)
@@ -87,37 +83,29 @@ def plain_trunk(
     return ImageTrunk(convs, [pools for _, _, pools in stages], config)
 
 
-@NETWORKS.register("cnn")
-class CNNConfig(ImageNetworkConfig):
-    """Hyper-parameters of the plain convolutional actor-critic.
+def build_cnn(config: CNNConfig, spec: ActorCriticSpec) -> ActorCritic:
+    """Return freshly initialised modules."""
+    config.check_images(spec)
+    features = scaled_width(_WIDTHS[-1], config.width) + spec.vector_size
+    trunk = _trunk(config, spec)
+    loc, log_std = (nn.Linear(features, spec.action_size) for _ in range(2))
+    networks = ActorCritic(
+        actor=PlainActor(trunk, nn.Identity(), loc, log_std),
+        encoder=_trunk(config, spec),
+        critic=_critic(config, spec, features),
+    )
+    for network in networks:
+        network.reset_parameters()
+    return networks
 
-    Args:
-        width: factor on every layer's width; 1 is the reference's size.
-    """
 
-    width: float = Field(default=1.0, gt=0)
+def _critic(config: CNNConfig, spec: ActorCriticSpec, features: int) -> nn.Module:
+    hidden = scaled_width(_HIDDEN, config.width)
+    if spec.critics is None:
+        return PlainTwinCritic(mlp(features + spec.action_size, hidden, 1) for _ in range(2))
+    first = nn.Linear(features + spec.action_size, spec.critics * hidden)
+    return EnsembleCritic(first, spec.critics, hidden)
 
-    def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules."""
-        self.check_images(spec)
-        features = scaled_width(_WIDTHS[-1], self.width) + spec.vector_size
-        trunk = self._trunk(spec)
-        loc, log_std = (nn.Linear(features, spec.action_size) for _ in range(2))
-        networks = ActorCritic(
-            actor=PlainActor(trunk, nn.Identity(), loc, log_std),
-            encoder=self._trunk(spec),
-            critic=self._critic(spec, features),
-        )
-        for network in networks:
-            network.reset_parameters()
-        return networks
 
-    def _critic(self, spec: ActorCriticSpec, features: int) -> nn.Module:
-        hidden = scaled_width(_HIDDEN, self.width)
-        if spec.critics is None:
-            return PlainTwinCritic(mlp(features + spec.action_size, hidden, 1) for _ in range(2))
-        first = nn.Linear(features + spec.action_size, spec.critics * hidden)
-        return EnsembleCritic(first, spec.critics, hidden)
-
-    def _trunk(self, spec: ActorCriticSpec) -> ImageTrunk:
-        return plain_trunk(self, spec, [scaled_width(width, self.width) for width in _WIDTHS])
+def _trunk(config: CNNConfig, spec: ActorCriticSpec) -> ImageTrunk:
+    return plain_trunk(config, spec, [scaled_width(width, config.width) for width in _WIDTHS])

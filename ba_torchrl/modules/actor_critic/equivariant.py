@@ -12,19 +12,14 @@ from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
-from ba_torchrl.modules.actor_critic.trunk import (
-    ImageNetworkConfig,
-    ImageTrunk,
-    scale_from_log_std,
-    trunk_stages,
-)
-from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.actor_critic.equivariant_config import EquivariantConfig
+from ba_torchrl.modules.actor_critic.trunk import ImageTrunk, scale_from_log_std, trunk_stages
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.steerable.layers import (
     FieldTypes,
     SteerableConv2d,
@@ -227,91 +222,57 @@ class EquivariantTwinCritic(nn.Module):
         return torch.cat(values, dim=-1)
 
 
-@NETWORKS.register("equi")
-class EquivariantConfig(ImageNetworkConfig):
-    """Hyper-parameters of the equivariant actor-critic.
+def build_equivariant(config: EquivariantConfig, spec: ActorCriticSpec) -> ActorCritic:
+    """Return freshly initialised modules for an action with x and y."""
+    config.check_images(spec)
+    if config.reflections and config.group_order < 3:
+        raise ValueError("reflections need a group_order of at least 3")
+    gspace = planar_rotations(config.group_order, has_flips=config.reflections)
+    action = ActionFields(spec.action_sequence, has_reflections=config.reflections)
+    pose = PoseFields(spec, has_reflections=config.reflections)
+    features = [(gspace.regular_repr, config.n_hidden), *pose.types(gspace)]
+    actor = EquivariantActor(gspace, _trunk(config, gspace, spec), features, action, pose)
+    encoder: nn.Module = _trunk(config, gspace, spec)
+    return ActorCritic(
+        actor=actor,
+        encoder=EquivariantEncoder(encoder, pose) if spec.vectors else encoder,
+        critic=_critic(config, gspace, features, action, spec.critics),
+    )
 
-    Args:
-        group_order: number of rotations n of the group, at least 2; the default is that of the
-            reference implementation.
-        reflections: the group is the dihedral group D_n, with n at least 3, instead of the cyclic
-            group C_n.
-        n_hidden: number of regular fields of the last layers; the default is that of the reference
-            implementation. The first layer has an eighth of it
-            at 128 px, and a quarter at 64 px, where the first stage is left out.
-    """
 
-    group_order: int = Field(default=8, ge=2)
-    reflections: bool = False
-    n_hidden: int = Field(default=64, ge=4)
+def _critic(
+    config: EquivariantConfig,
+    gspace: GSpace2D,
+    features: FieldTypes,
+    action: ActionFields,
+    critics: int | None,
+) -> nn.Module:
+    if critics is None:
+        return EquivariantTwinCritic(gspace, features, action)
+    regular, fields = gspace.regular_repr, config.n_hidden
+    inputs = [*features, *action.types(gspace)]
+    first = steerable_linear(gspace, inputs, [(regular, critics * fields)])
+    return EnsembleCritic(first, critics, fields, regular.size, action.group)
 
-    def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules for an action with x and y."""
-        self.check_images(spec)
-        if self.reflections and self.group_order < 3:
-            raise ValueError("reflections need a group_order of at least 3")
-        gspace = planar_rotations(self.group_order, has_flips=self.reflections)
-        action = ActionFields(spec.action_sequence, has_reflections=self.reflections)
-        pose = PoseFields(spec, has_reflections=self.reflections)
-        features = [(gspace.regular_repr, self.n_hidden), *pose.types(gspace)]
-        actor = EquivariantActor(gspace, self._trunk(gspace, spec), features, action, pose)
-        encoder: nn.Module = self._trunk(gspace, spec)
-        return ActorCritic(
-            actor=actor,
-            encoder=EquivariantEncoder(encoder, pose) if spec.vectors else encoder,
-            critic=self._critic(gspace, features, action, spec.critics),
+
+def _trunk(config: EquivariantConfig, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
+    n = config.n_hidden
+    stages = trunk_stages(spec.image_size, (n / 8, n / 4, n / 2, n, 2 * n, n, n))
+    divisor = round(n / stages[0][0])
+    if n % divisor:
+        raise ValueError(
+            f"n_hidden must be a multiple of {divisor} at {spec.image_size} px, since the "
+            f"first layer has n_hidden/{divisor} fields; got {n}"
         )
-
-    def _critic(
-        self, gspace: GSpace2D, features: FieldTypes, action: ActionFields, critics: int | None
-    ) -> nn.Module:
-        if critics is None:
-            return EquivariantTwinCritic(gspace, features, action)
-        regular, fields = gspace.regular_repr, self.n_hidden
-        inputs = [*features, *action.types(gspace)]
-        first = steerable_linear(gspace, inputs, [(regular, critics * fields)])
-        return EnsembleCritic(first, critics, fields, regular.size, action.group)
-
-    def _trunk(self, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
-        n = self.n_hidden
-        stages = trunk_stages(spec.image_size, (n / 8, n / 4, n / 2, n, 2 * n, n, n))
-        divisor = round(n / stages[0][0])
-        if n % divisor:
-            raise ValueError(
-                f"n_hidden must be a multiple of {divisor} at {spec.image_size} px, since the "
-                f"first layer has n_hidden/{divisor} fields; got {n}"
-            )
-        regular = gspace.regular_repr
-        fields: FieldTypes = [(gspace.trivial_repr, self.input_channels(spec.image_channels))]
-        convs = []
-        for width, padding, pools in stages:
-            out = [(regular, int(width))]
-            convs.append(self._convolution(gspace, fields, out, padding, pools))
-            fields = out
-        pools = [  # a stride halves the image as a pool does
-            pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)
-        ]
-        return ImageTrunk(convs, pools, self)
-
-    def _convolution(
-        self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool
-    ) -> SteerableConv2d:
-        return SteerableConv2d(gspace, inputs, outputs, 3, padding=padding)
-
-
-@NETWORKS.register("equi_strided")
-class StridedEquivariantConfig(EquivariantConfig):
-    """Hyper-parameters of the equivariant actor-critic with strided convolutions, not max pools.
-
-    Not part of the paper. A 4x4 kernel with stride 2 reads pixels that are symmetric about the
-    centre of the image, so that quarter turns remain exact; a 3x3 kernel with stride 2 does not. It
-    takes four products per input pixel and pair of channels where a 3x3 kernel before a max pool
-    takes nine. The stages, their numbers of fields and the arguments are those of
-    `EquivariantConfig`.
-    """
-
-    def _convolution(
-        self, gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes, padding: int, pools: bool
-    ) -> SteerableConv2d:
-        size, stride = (4, 2) if pools else (3, 1)
-        return SteerableConv2d(gspace, inputs, outputs, size, padding=padding, stride=stride)
+    regular = gspace.regular_repr
+    fields: FieldTypes = [(gspace.trivial_repr, config.input_channels(spec.image_channels))]
+    convs = []
+    for width, padding, pools in stages:
+        out = [(regular, int(width))]
+        size, stride = (4, 2) if pools and config.is_strided else (3, 1)
+        convs.append(SteerableConv2d(gspace, fields, out, size, padding=padding, stride=stride))
+        fields = out
+    pools = [  # a stride halves the image as a pool does
+        pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)
+    ]
+    return ImageTrunk(convs, pools, config)

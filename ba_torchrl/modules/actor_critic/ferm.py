@@ -5,15 +5,13 @@ The architecture is the reference implementation's; the appendix does not give i
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
 from ba_torchrl.modules.actor_critic.cnn import PlainActor, PlainTwinCritic, mlp, plain_trunk
-from ba_torchrl.modules.actor_critic.trunk import ImageNetworkConfig, ImageTrunk
-from ba_torchrl.modules.base import NETWORKS, ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.actor_critic.ferm_config import FERMConfig
+from ba_torchrl.modules.actor_critic.trunk import ImageTrunk
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
 from ba_torchrl.modules.layers import XavierInitialised, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 1024)
@@ -38,37 +36,20 @@ def _normalised(width: int, features: int) -> nn.Sequential:
     return nn.Sequential(nn.Linear(width, features), nn.LayerNorm(features))
 
 
-@NETWORKS.register("ferm")
-class FERMConfig(ImageNetworkConfig):
-    """Hyper-parameters of the actor-critic of FERM.
-
-    The policy uses the convolutions of the critics' encoder, and has its own features. The losses
-    of actors and critics take the shared parameters as constants in the actor's terms; behaviour
-    cloning trains them.
-
-    Args:
-        width: factor on the width of convolutions and hidden layers; 1 is the reference's size.
-        features: size of the encoder's features of the image, on which the contrastive loss acts.
-    """
-
-    shares_encoder: ClassVar[bool] = True
-    width: float = Field(default=1.0, gt=0)
-    features: int = Field(default=50, ge=1)
-
-    def build(self, spec: ActorCriticSpec) -> ActorCritic:
-        """Return freshly initialised modules; actor and encoder share the trunk."""
-        self.check_images(spec)
-        widths = [scaled_width(width, self.width) for width in _WIDTHS]
-        width, hidden, size = widths[-1], scaled_width(_HIDDEN, self.width), spec.action_size
-        trunk = plain_trunk(self, spec, widths)
-        head = _normalised(width, self.features)
-        features = self.features + spec.vector_size
-        loc, log_std = (mlp(features, hidden, hidden, size) for _ in range(2))
-        networks = ActorCritic(
-            actor=PlainActor(trunk, head, loc, log_std),
-            encoder=FERMEncoder(trunk, width, self.features),
-            critic=PlainTwinCritic(mlp(features + size, hidden, hidden, 1) for _ in range(2)),
-        )
-        for network in networks:
-            network.reset_parameters()
-        return networks
+def build_ferm(config: FERMConfig, spec: ActorCriticSpec) -> ActorCritic:
+    """Return freshly initialised modules; actor and encoder share the trunk."""
+    config.check_images(spec)
+    widths = [scaled_width(width, config.width) for width in _WIDTHS]
+    width, hidden, size = widths[-1], scaled_width(_HIDDEN, config.width), spec.action_size
+    trunk = plain_trunk(config, spec, widths)
+    head = _normalised(width, config.features)
+    features = config.features + spec.vector_size
+    loc, log_std = (mlp(features, hidden, hidden, size) for _ in range(2))
+    networks = ActorCritic(
+        actor=PlainActor(trunk, head, loc, log_std),
+        encoder=FERMEncoder(trunk, width, config.features),
+        critic=PlainTwinCritic(mlp(features + size, hidden, hidden, 1) for _ in range(2)),
+    )
+    for network in networks:
+        network.reset_parameters()
+    return networks

@@ -11,29 +11,32 @@ from typing import Any, NamedTuple
 
 import torch
 import torch.nn.functional as F
-from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import XavierInitialised
+from ba_torchrl.modules.spatial.asr_config import ASRConfig, ASRNetworkConfig
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
     Level,
-    SpatialImageConfig,
     SpatialQNetwork,
     SpatialSpec,
+    dense_width,
     require_unet_size,
     require_yaw,
+    scaled_heights,
+    scaled_in_hand,
     select_primitive,
 )
 from ba_torchrl.modules.spatial.in_hand import InHandMap
 from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
 from ba_torchrl.modules.spatial.pose_views import (
-    PoseGridConfig,
     TiltedView,
     UprightView,
     is_six_dof,
+    pose_grid,
+    pose_levels,
 )
+from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 from ba_torchrl.modules.spatial.unet import PlainPixelValues
 from ba_torchrl.modules.spatial.views import HeightView, centre_fit
 
@@ -93,30 +96,19 @@ class ASR(SpatialQNetwork):
         return self.heads[level - 1](view, state.in_hand, state.scene, state.holding)
 
 
-class ASRNetworkConfig(SpatialImageConfig):
-    """Hyper-parameters of every ASR network.
-
-    Args:
-        num_rotations: yaws, evenly spaced; the default is that of the reference implementation.
-        patch_size: rows and columns of the patch around a pixel that the later levels see; None for
-            the size of the in-hand image (in the paper 24, and 40 on bumps). If the two sizes
-            differ, the in-hand image is cropped or zero-padded to the patch size about its centre.
-    """
-
-    num_rotations: int = Field(default=16, ge=2)
-    patch_size: int | None = Field(default=None, ge=1)
-
-    def _planar_layout(self, name: str, spec: SpatialSpec) -> tuple[tuple[Level, Level], int]:
-        """Return the levels of pixels and yaws, and the patch's size."""
-        require_unet_size(name, spec.image_size)
-        patch_size = self.patch_size or spec.in_hand_size
-        if (patch_size - spec.in_hand_size) % 2:
-            raise ValueError(
-                f"patch_size and in_hand_size must share a centre, so differ by an even number of "
-                f"pixels; got {patch_size} and {spec.in_hand_size}"
-            )
-        pixels = Level(("x", "y"), (spec.image_size, spec.image_size))
-        return (pixels, Level(("rz",), (self.num_rotations,))), patch_size
+def planar_layout(
+    config: ASRNetworkConfig, name: str, spec: SpatialSpec
+) -> tuple[tuple[Level, Level], int]:
+    """Return the levels of pixels and yaws, and the patch's size."""
+    require_unet_size(name, spec.image_size)
+    patch_size = config.patch_size or spec.in_hand_size
+    if (patch_size - spec.in_hand_size) % 2:
+        raise ValueError(
+            f"patch_size and in_hand_size must share a centre, so differ by an even number of "
+            f"pixels; got {patch_size} and {spec.in_hand_size}"
+        )
+    pixels = Level(("x", "y"), (spec.image_size, spec.image_size))
+    return (pixels, Level(("rz",), (config.num_rotations,))), patch_size
 
 
 _LARGEST_MAP = 8
@@ -137,7 +129,7 @@ class PlainYawValues(XavierInitialised):
         self.config = config
         self.patch = InHandMap(1 + spec.in_hand_channels, patch_size, config.width)
         self.map_size = min(self.patch.out_size, _LARGEST_MAP)
-        hidden = config.scaled_dense_width(1024)
+        hidden = dense_width(config, 1024)
         self.linear = nn.Linear(
             self.patch.out_channels * self.map_size**2
             + scene_channels * (spec.image_size // UNET_STRIDE) ** 2,
@@ -155,8 +147,8 @@ class PlainYawValues(XavierInitialised):
             scene: [B, scene_channels, H/16, W/16].
             holding: [B, 1], which selects the primitive.
         """
-        hand = centre_fit(self.config.in_hand(in_hand), patch.shape[-1])
-        x = self.patch(torch.cat([self.config.heights(patch[:, 0]), hand], dim=1))
+        hand = centre_fit(scaled_in_hand(self.config, in_hand), patch.shape[-1])
+        x = self.patch(torch.cat([scaled_heights(self.config, patch[:, 0]), hand], dim=1))
         if x.shape[-1] != self.map_size:
             size = (self.map_size, self.map_size)
             x = F.interpolate(x, size, mode="bilinear", align_corners=False)
@@ -164,45 +156,39 @@ class PlainYawValues(XavierInitialised):
         return select_primitive(self.values(F.relu(self.linear(x))), holding)
 
 
-@NETWORKS.register("asr")
-class ASRConfig(ASRNetworkConfig, PoseGridConfig):
-    """Hyper-parameters of the plain network that chooses one component after the other.
+def build_asr(config: ASRConfig, spec: SpatialSpec) -> ASR:
+    """Return a freshly initialised network for x, y and rz, or x, y, z, rz, ry and rx."""
+    if is_six_dof(spec):
+        return _build_for_poses(config, spec)
+    require_yaw("asr", spec)
+    levels, patch_size = planar_layout(config, "asr", spec)
+    positions = PlainPixelValues(spec, config, maps=1)
+    yaws = PlainYawValues(spec, config, config.num_rotations, patch_size, positions.scene_channels)
+    return ASR(positions, [(HeightView(patch_size), yaws)], levels)
 
-    The hyper-parameters of z and the tilts apply to actions in six degrees of freedom only.
-    """
 
-    def build(self, spec: SpatialSpec) -> ASR:
-        """Return a freshly initialised network for x, y and rz, or x, y, z, rz, ry and rx."""
-        if is_six_dof(spec):
-            return self._build_for_poses(spec)
-        require_yaw("asr", spec)
-        levels, patch_size = self._planar_layout("asr", spec)
-        positions = PlainPixelValues(spec, self, maps=1)
-        yaws = PlainYawValues(spec, self, self.num_rotations, patch_size, positions.scene_channels)
-        return ASR(positions, [(HeightView(patch_size), yaws)], levels)
-
-    def _build_for_poses(self, spec: SpatialSpec) -> ASR:
-        """Return the network of five levels; every later level has one view and all its values."""
-        planar, patch_size = self._planar_layout("asr", spec)
-        levels = (*planar, *self.pose_levels())
-        grid = self.pose_grid(self.num_rotations, spec.half_rotation)
-        positions = PlainPixelValues(spec, self, maps=1)
-        views = (
-            HeightView(patch_size),
-            HeightView(patch_size, grid.rz_rad),
-            UprightView(grid, spec.pixel_m, patch_size),
-            TiltedView(grid._replace(rx_rad=(0.0,)), spec.pixel_m, patch_size),
+def _build_for_poses(config: ASRConfig, spec: SpatialSpec) -> ASR:
+    """Return the network of five levels; every later level has one view and all its values."""
+    planar, patch_size = planar_layout(config, "asr", spec)
+    levels = (*planar, *pose_levels(config))
+    grid = pose_grid(config, config.num_rotations, spec.half_rotation)
+    positions = PlainPixelValues(spec, config, maps=1)
+    views = (
+        HeightView(patch_size),
+        HeightView(patch_size, grid.rz_rad),
+        UprightView(grid, spec.pixel_m, patch_size),
+        TiltedView(grid._replace(rx_rad=(0.0,)), spec.pixel_m, patch_size),
+    )
+    in_voxels = config.in_voxels(spec.pixel_m)
+    heads = [
+        PoseValues(
+            spec,
+            in_voxels,
+            view.channels,
+            level.shape[0],
+            patch_size,
+            SceneMapVector(positions.scene_channels, spec.image_size, config),
         )
-        in_voxels = self.in_voxels(spec.pixel_m)
-        heads = [
-            PoseValues(
-                spec,
-                in_voxels,
-                view.channels,
-                level.shape[0],
-                patch_size,
-                SceneMapVector(positions.scene_channels, spec.image_size, self),
-            )
-            for view, level in zip(views, levels[1:], strict=True)
-        ]
-        return ASR(positions, list(zip(views, heads, strict=True)), levels, self.limits)
+        for view, level in zip(views, levels[1:], strict=True)
+    ]
+    return ASR(positions, list(zip(views, heads, strict=True)), levels, config.limits)

@@ -7,17 +7,15 @@ from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
-from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.modules.base import Control, NetworkConfig
-from ba_torchrl.modules.layers import Precision, compute_dtype, scaled_width
+from ba_torchrl.modules.layers import compute_dtype, scaled_width
+from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 
 
 @dataclass(frozen=True)
@@ -119,56 +117,28 @@ UNET_STRIDE = 16
 """Pixels of the image per pixel of a UNet's bottleneck map; image sizes are multiples of it."""
 
 
-class SpatialImageConfig(NetworkConfig):
-    """Hyper-parameters of every spatial Q network.
+def dense_width(config: SpatialImageConfig, width: int) -> int:
+    """Return the width of a fully connected layer of ``width`` in the reference's size."""
+    return scaled_width(width, config.width if config.dense_width is None else config.dense_width)
 
-    By default heights are in metres, as in the reference implementation, and a block of 3 cm hardly
-    affects the values of a freshly initialised network. With a scale of 0.05 it has a height of
-    about one, and learning is faster at the start.
 
-    Args:
-        precision: number format of the convolutions, see `compute_dtype`. Values of actions, the
-            fully connected layers and the filters' coefficients are always float32.
-        height_scale_m: height that is scaled to one. The floor stays zero, like the padding.
-        voxel_scale: number of voxels of a projection that is scaled to one.
-        width: factor on every layer's width; 1 is the reference's size.
-        dense_width: factor on the widths of the hidden fully connected layers; None for `width`.
-            They hold most of the parameters of a narrow network.
-    """
+def scaled_heights(config: SpatialImageConfig, images: Tensor) -> Tensor:
+    """Return heights [B, 1, H, W] divided by the scale, in the compute dtype."""
+    scale = config.height_scale_m
+    return _computed(config, images if scale == 1 else images / scale)
 
-    control: ClassVar[Control] = "open_loop"
-    image_keys: ClassVar[tuple[str, ...]] = (keys.HEIGHTMAP, keys.IN_HAND)
-    vector_keys: ClassVar[tuple[str, ...]] = ()
 
-    precision: Precision = "auto"
-    height_scale_m: float = Field(default=1.0, gt=0)
-    voxel_scale: float = Field(default=1.0, gt=0)
-    width: float = Field(default=1.0, gt=0)
-    dense_width: float | None = Field(default=None, gt=0)
+def scaled_in_hand(config: SpatialImageConfig, images: Tensor) -> Tensor:
+    """Return scaled heights (C = 1) or projections [B, C, h, w] in the compute dtype."""
+    if images.shape[1] == 1:
+        return scaled_heights(config, images)
+    return _computed(config, images if config.voxel_scale == 1 else images / config.voxel_scale)
 
-    def scaled_dense_width(self, width: int) -> int:
-        """Return the width of a fully connected layer of ``width`` in the reference's size."""
-        return scaled_width(width, self.width if self.dense_width is None else self.dense_width)
 
-    def heights(self, images: Tensor) -> Tensor:
-        """Return heights [B, 1, H, W] divided by the scale, in the compute dtype."""
-        return self.images(images if self.height_scale_m == 1 else images / self.height_scale_m)
-
-    def in_hand(self, images: Tensor) -> Tensor:
-        """Return scaled heights (C = 1) or projections [B, C, h, w] in the compute dtype."""
-        if images.shape[1] == 1:
-            return self.heights(images)
-        return self.images(images if self.voxel_scale == 1 else images / self.voxel_scale)
-
-    def in_voxels(self, pixel_m: float) -> Self:
-        """Return a copy that scales heights like projections, whose voxels have the edge
-        ``pixel_m``."""
-        return self.model_copy(update={"height_scale_m": pixel_m * self.voxel_scale})
-
-    def images(self, images: Tensor) -> Tensor:
-        """Return images [B, C, H, W] in the compute dtype, channels-last."""
-        dtype = compute_dtype(self.precision, images.device)
-        return images.to(dtype=dtype, memory_format=torch.channels_last)
+def _computed(config: SpatialImageConfig, images: Tensor) -> Tensor:
+    """Return images [B, C, H, W] in the compute dtype, channels-last."""
+    dtype = compute_dtype(config.precision, images.device)
+    return images.to(dtype=dtype, memory_format=torch.channels_last)
 
 
 def select_primitive(values: Tensor, holding: Tensor) -> Tensor:

@@ -10,8 +10,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.modules.layers import scaled_width
-from ba_torchrl.modules.spatial.base import SpatialImageConfig, SpatialSpec
+from ba_torchrl.modules.spatial.base import (
+    SpatialSpec,
+    dense_width,
+    scaled_heights,
+    scaled_in_hand,
+)
 from ba_torchrl.modules.spatial.in_hand import InHandVector
+from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 from ba_torchrl.modules.spatial.unet import ResidualBlock, UNet
 from ba_torchrl.modules.steerable.layers import (
     DynamicSteerableConv2d,
@@ -104,7 +110,7 @@ class EquivariantPixelValues(nn.Module):
         regular = gspace.regular_repr
         self._group_size = regular.size
         self.scene_channels = fields[-1]
-        wide = config.scaled_dense_width(1024)
+        wide = dense_width(config, 1024)
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
         self.hand.reset_parameters()
         self.unet = equivariant_unet(gspace, fields)
@@ -132,11 +138,11 @@ class EquivariantPixelValues(nn.Module):
 
     def _fields(self, heightmap: Tensor) -> tuple[Tensor, Tensor]:
         """Return the regular fields of every pixel and the invariant bottleneck map."""
-        maps = self.unet.encode(self.config.heights(heightmap))
+        maps = self.unet.encode(scaled_heights(self.config, heightmap))
         return self.unet.decode(maps), maps[-1].unflatten(1, (-1, self._group_size)).amax(dim=2)
 
     def _place_values(self, fields: Tensor, in_hand: Tensor) -> Tensor:
-        coefficients = self.coefficients(self.hand(self.config.in_hand(in_hand)))
+        coefficients = self.coefficients(self.hand(scaled_in_hand(self.config, in_hand)))
         return self.place(F.relu(self.held(fields, coefficients)))
 
     def _sorted_values(

@@ -10,10 +10,12 @@ from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
-    SpatialImageConfig,
     SpatialSpec,
+    dense_width,
+    scaled_in_hand,
     select_primitive,
 )
+from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 from ba_torchrl.modules.spatial.views import centre_fit
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
@@ -45,7 +47,7 @@ class SceneMapVector(nn.Module):
                 f"six degrees of freedom need an obs_size of at least 32, got {image_size}"
             )
         inner = scaled_width(128, config.width)
-        wide, self.out_features = (config.scaled_dense_width(w) for w in (1024, 512))
+        wide, self.out_features = (dense_width(config, w) for w in (1024, 512))
         self.copies = copies
         self.conv = CastConv2d(copies * channels, inner, 3, padding=1)
         self.first = nn.Linear(inner * side * side, wide)
@@ -92,7 +94,7 @@ class PoseValues(XavierInitialised):
         self.convs = nn.ModuleList(
             CastConv2d(a, b, 3, padding=1) for a, b in zip(inputs, widths, strict=True)
         )
-        wide, narrow = config.scaled_dense_width(1024), config.scaled_dense_width(512)
+        wide, narrow = dense_width(config, 1024), dense_width(config, 512)
         self.wide = nn.Linear(widths[-1] * last * last, wide)
         self.narrow = nn.Linear(wide, narrow)
         self.scene = scene
@@ -119,10 +121,10 @@ class PoseValues(XavierInitialised):
     def _features(self, views: Tensor, in_hand: Tensor) -> Tensor:
         """Return float32 features [B * K, n]."""
         first, *others = self.convs
-        hand = centre_fit(self.config.in_hand(in_hand), views.shape[-1])
+        hand = centre_fit(scaled_in_hand(self.config, in_hand), views.shape[-1])
         of_view, of_hand = first.weight.split([views.shape[2], hand.shape[1]], dim=1)
         # The sum of both convolutions is that of the concatenated channels.
-        x = _convolve(self.config.in_hand(views.flatten(0, 1)), of_view, first.bias)
+        x = _convolve(scaled_in_hand(self.config, views.flatten(0, 1)), of_view, first.bias)
         x.unflatten(0, views.shape[:2]).add_(_convolve(hand, of_hand)[:, None])
         for conv in others:
             x = conv(relu_of_max_pool(x))

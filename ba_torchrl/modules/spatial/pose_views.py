@@ -7,12 +7,11 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import torch
-from pydantic import Field
 from torch import Tensor
 
-from ba_torchrl.core.config import StrictModel
 from ba_torchrl.modules.layers import constants
 from ba_torchrl.modules.spatial.base import Level, SpatialSpec
+from ba_torchrl.modules.spatial.pose_grid_config import PoseGridConfig
 from ba_torchrl.modules.spatial.projections import cell_table, project, project_upright
 from ba_torchrl.modules.spatial.views import patches
 
@@ -42,44 +41,21 @@ def is_six_dof(spec: SpatialSpec) -> bool:
     return set(spec.components) == set(POSE_COMPONENTS)
 
 
-class PoseGridConfig(StrictModel):
-    """Hyper-parameters of the levels of z and the tilts; the defaults are those of the
-    reference implementation; the appendix gives none.
+def pose_levels(config: PoseGridConfig) -> tuple[Level, Level, Level]:
+    """Return the levels of z, ry and rx."""
+    counts = {"z": config.num_z, "ry": config.num_tilts, "rx": config.num_tilts}
+    return tuple(Level((name,), (count,)) for name, count in counts.items())
 
-    Args:
-        num_z: heights of the tool, evenly spaced.
-        min_z_m: least height.
-        max_z_m: greatest height.
-        num_tilts: values of ry, and of rx, evenly spaced.
-        max_tilt_rad: greatest tilt; the least is its negative.
-    """
 
-    num_z: int = Field(default=36, ge=2)
-    min_z_m: float = 0.02
-    max_z_m: float = 0.20
-    num_tilts: int = Field(default=7, ge=2)
-    max_tilt_rad: float = Field(default=math.pi / 8, gt=0)
-
-    @property
-    def limits(self) -> dict[str, tuple[float, float]]:
-        """First and last value on the grids of z and the tilts."""
-        tilts = (-self.max_tilt_rad, self.max_tilt_rad)
-        return {"z": (self.min_z_m, self.max_z_m), "ry": tilts, "rx": tilts}
-
-    def pose_levels(self) -> tuple[Level, Level, Level]:
-        """Return the levels of z, ry and rx."""
-        counts = {"z": self.num_z, "ry": self.num_tilts, "rx": self.num_tilts}
-        return tuple(Level((name,), (count,)) for name, count in counts.items())
-
-    def pose_grid(self, num_rotations: int, half_rotation: bool) -> PoseGrid:
-        """Return the values of z and the angles; yaws span half a turn or a whole one."""
-        turn = math.pi if half_rotation else 2 * math.pi
-        values = {
-            level.components[0]: _spaced(*self.limits[level.components[0]], level.shape[0])
-            for level in self.pose_levels()
-        }
-        yaws = tuple(i * (turn / num_rotations) for i in range(num_rotations))
-        return PoseGrid(values["z"], yaws, values["ry"], values["rx"])
+def pose_grid(config: PoseGridConfig, num_rotations: int, half_rotation: bool) -> PoseGrid:
+    """Return the values of z and the angles; yaws span half a turn or a whole one."""
+    turn = math.pi if half_rotation else 2 * math.pi
+    values = {
+        level.components[0]: _spaced(*config.limits[level.components[0]], level.shape[0])
+        for level in pose_levels(config)
+    }
+    yaws = tuple(i * (turn / num_rotations) for i in range(num_rotations))
+    return PoseGrid(values["z"], yaws, values["ry"], values["rx"])
 
 
 def _spaced(first: float, last: float, count: int) -> tuple[float, ...]:

@@ -6,19 +6,17 @@ import math
 from typing import Any
 
 import torch
-from pydantic import Field
 from torch import Tensor, nn
 
-from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.base import (
     UNET_STRIDE,
     Level,
-    SpatialImageConfig,
     SpatialQNetwork,
     SpatialSpec,
     require_yaw,
     yaws_rad,
 )
+from ba_torchrl.modules.spatial.rot_fcn_config import RotFCNConfig
 from ba_torchrl.modules.spatial.unet import PlainPixelValues
 from ba_torchrl.modules.spatial.views import sample, sampling_grid
 
@@ -56,23 +54,13 @@ class RotFCN(SpatialQNetwork):
         return sample(values, sampling_grid(centers, -yaws, size, padded)).transpose(0, 1), None
 
 
-@NETWORKS.register("rot_fcn")
-class RotFCNConfig(SpatialImageConfig):
-    """Hyper-parameters of the Rot FCN.
-
-    Args:
-        num_rotations: yaws, evenly spaced; the default is that of the reference implementation.
-    """
-
-    num_rotations: int = Field(default=16, ge=2)
-
-    def build(self, spec: SpatialSpec) -> RotFCN:
-        """Return a freshly initialised network for x, y and rz."""
-        require_yaw("rot_fcn", spec)
-        if spec.image_size % 2:
-            raise ValueError(
-                f"network 'rot_fcn' pads the image equally on all sides, which needs an even "
-                f"obs_size; got {spec.image_size}"
-            )
-        values = PlainPixelValues(spec, self, maps=1)
-        return RotFCN(values, spec.image_size, self.num_rotations, spec.half_rotation)
+def build_rot_fcn(config: RotFCNConfig, spec: SpatialSpec) -> RotFCN:
+    """Return a freshly initialised network for x, y and rz."""
+    require_yaw("rot_fcn", spec)
+    if spec.image_size % 2:
+        raise ValueError(
+            f"network 'rot_fcn' pads the image equally on all sides, which needs an even "
+            f"obs_size; got {spec.image_size}"
+        )
+    values = PlainPixelValues(spec, config, maps=1)
+    return RotFCN(values, spec.image_size, config.num_rotations, spec.half_rotation)

@@ -9,8 +9,14 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
-from ba_torchrl.modules.spatial.base import SpatialImageConfig, SpatialSpec, select_primitive
+from ba_torchrl.modules.spatial.base import (
+    SpatialSpec,
+    scaled_heights,
+    scaled_in_hand,
+    select_primitive,
+)
 from ba_torchrl.modules.spatial.in_hand import InHandMap
+from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 
 _WIDTHS = (32, 64, 128, 256, 512)
 
@@ -129,8 +135,8 @@ class PlainPixelValues(XavierInitialised):
         Returns:
             float32 [n*B, maps, H, W], and [n*B, scene_channels, H/16, W/16].
         """
-        *skips, inner = self.unet.encode(self.config.heights(heightmap))
-        hand = self.hand(self.config.in_hand(in_hand))
+        *skips, inner = self.unet.encode(scaled_heights(self.config, heightmap))
+        hand = self.hand(scaled_in_hand(self.config, in_hand))
         if hand.shape[-2:] != inner.shape[-2:]:
             hand = F.interpolate(hand, inner.shape[-2:], mode="bilinear", align_corners=False)
         views = len(heightmap) // len(in_hand)

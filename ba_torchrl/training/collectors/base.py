@@ -1,11 +1,10 @@
-"""Interface of the collectors, and their registry."""
+"""Interface of collections."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from tensordict import TensorDict
@@ -13,9 +12,11 @@ from tensordict.nn import TensorDictModuleBase
 from torchrl.envs import EnvBase
 
 from ba_torchrl.algorithms.base import Learner
-from ba_torchrl.core.config import StrictModel, WorkerOptions
-from ba_torchrl.core.registry import Registry
+from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.envs.episode_positions import EpisodePosition
+from ba_torchrl.training.collectors.config import COLLECTORS, CollectorConfig
+
+__all__ = ["COLLECTORS", "Collection", "CollectionProblem", "CollectorConfig"]
 
 
 @dataclass(frozen=True)
@@ -70,31 +71,3 @@ class Collection(ABC):
     @abstractmethod
     def close(self) -> None:
         """End the workers and close the environments; further calls have no effect."""
-
-
-class CollectorConfig(StrictModel, ABC):
-    """Options of a collector."""
-
-    resources: ClassVar[frozenset[str]] = frozenset()
-    """Fields that do not affect learning; a resumed run may have other values."""
-
-    def check(self, num_envs: int) -> None:
-        """Raise `ConfigError` unless the collector can be used, before anything starts."""
-        return
-
-    @abstractmethod
-    def start(
-        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
-    ) -> Collection:
-        """Start to collect.
-
-        Args:
-            problem: the run's environments and policy.
-            positions: that `Collection.get_positions` returned, from which the environments
-                continue; None to start new episodes.
-        """
-
-
-COLLECTORS: Registry[type[CollectorConfig]] = Registry(
-    "collector", "ba_torchrl.training.collectors", CollectorConfig
-)

@@ -23,8 +23,10 @@ from torchrl.weight_update import MultiProcessWeightSyncScheme
 
 from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.envs.vector.worker import SentError, end_with, is_of_code
-from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
-from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig, failed_too_often
+from ba_torchrl.training.collectors.base import CollectionProblem
+from ba_torchrl.training.collectors.config import WorkersConfig
+from ba_torchrl.training.collectors.multi_config import MultiAsyncConfig, MultiSyncConfig
+from ba_torchrl.training.collectors.workers import WorkerCollection, failed_too_often
 
 logger = logging.getLogger(__name__)
 
@@ -35,28 +37,20 @@ _OF_WORKERS = (RuntimeError, OSError, EOFError, ValueError)
 """Errors of TorchRL's collector when a worker ends or does not start."""
 
 
-@COLLECTORS.register("multi_sync")
-class MultiSyncConfig(WorkersConfig):
-    """The workers step at the same time, all with the weights of the latest update."""
-
-    def start(
-        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
-    ) -> MultiCollection:
-        """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
-        frames = self.steps_per_batch * problem.num_envs
-        return MultiCollection(problem, self, MultiSyncCollector, frames)
+def start_sync(
+    config: MultiSyncConfig, problem: CollectionProblem, _: Sequence[EpisodePosition] | None
+) -> MultiCollection:
+    """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
+    frames = config.steps_per_batch * problem.num_envs
+    return MultiCollection(problem, config, MultiSyncCollector, frames)
 
 
-@COLLECTORS.register("multi_async")
-class MultiAsyncConfig(WorkersConfig):
-    """The workers do not wait for each other, and step while the learner takes updates."""
-
-    def start(
-        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
-    ) -> MultiCollection:
-        """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
-        frames = self.steps_per_batch * problem.num_envs // self.workers
-        return MultiCollection(problem, self, _AsyncCollector, frames)
+def start_async(
+    config: MultiAsyncConfig, problem: CollectionProblem, _: Sequence[EpisodePosition] | None
+) -> MultiCollection:
+    """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
+    frames = config.steps_per_batch * problem.num_envs // config.workers
+    return MultiCollection(problem, config, _AsyncCollector, frames)
 
 
 class MultiCollection(WorkerCollection):

@@ -7,57 +7,28 @@ import time
 import warnings
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any, ClassVar
+from typing import Any
 
-from pydantic import Field
 from tensordict import TensorDict
 from torchrl.collectors import Collector
 from torchrl.collectors.distributed import RayCollector
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.base import SeedUse, derive_seed
+from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.envs.episode_positions import EpisodePosition
-from ba_torchrl.training.collectors.base import COLLECTORS, CollectionProblem
-from ba_torchrl.training.collectors.workers import WorkerCollection, WorkersConfig, failed_too_often
-from ba_torchrl.training.ray_cluster import (
-    check_installed,
-    check_resources,
-    connected_ray,
-    ray_module,
-)
+from ba_torchrl.training.collectors.base import CollectionProblem
+from ba_torchrl.training.collectors.ray_config import RayConfig
+from ba_torchrl.training.collectors.workers import WorkerCollection, failed_too_often
+from ba_torchrl.training.ray_cluster import check_resources, connected_ray, ray_module
 
 _FOREVER = sys.maxsize
 
 
-@COLLECTORS.register("ray")
-class RayConfig(WorkersConfig):
-    """Workers of a Ray cluster, each a Ray actor; they do not wait for each other.
-
-    Ray starts a worker of a machine that fails again on another one that has the resources. If a
-    worker fails more than ``max_restarts`` times before it returns a batch, collection ends; ends
-    of its process in the construction of its environments do not count.
-    """
-
-    resources: ClassVar[frozenset[str]] = frozenset({"workers", "cpus", "gpus", "address"})
-
-    cpus: float = Field(default=1.0, ge=0)
-    """CPU cores that Ray reserves for each worker."""
-    gpus: float = Field(default=0.0, ge=0)
-    """GPUs that Ray reserves for each worker; the policy of a worker runs on the CPU."""
-    address: str | None = None
-    """Address of the cluster, such as "auto"; None for `ray.init`'s default, which starts a
-    cluster of this machine if it is not part of one."""
-
-    def check(self, num_envs: int) -> None:
-        """Check that Ray is installed, and what `WorkersConfig` checks."""
-        super().check(num_envs)
-        check_installed("collector")
-
-    def start(
-        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
-    ) -> RayCollection:
-        """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
-        return RayCollection(problem, self)
+def start(
+    config: RayConfig, problem: CollectionProblem, _: Sequence[EpisodePosition] | None
+) -> RayCollection:
+    """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
+    return RayCollection(problem, config)
 
 
 class RayCollection(WorkerCollection):

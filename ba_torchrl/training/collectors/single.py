@@ -11,24 +11,16 @@ from torchrl.collectors import Collector
 
 from ba_torchrl.core import keys
 from ba_torchrl.envs.episode_positions import EpisodePosition
-from ba_torchrl.training.collectors.base import (
-    COLLECTORS,
-    Collection,
-    CollectionProblem,
-    CollectorConfig,
-)
+from ba_torchrl.training.collectors.base import Collection, CollectionProblem
+from ba_torchrl.training.collectors.single_config import SingleConfig
 from ba_torchrl.training.interruption import positions_of
 
 
-@COLLECTORS.register("single")
-class SingleConfig(CollectorConfig):
-    """One step of all environments at a time, in the learner's process."""
-
-    def start(
-        self, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
-    ) -> SingleCollection:
-        """Start to collect; see `CollectorConfig.start`."""
-        return SingleCollection(problem, positions)
+def start(
+    _: SingleConfig, problem: CollectionProblem, positions: Sequence[EpisodePosition] | None
+) -> SingleCollection:
+    """Start to collect; see `CollectorConfig.start`."""
+    return SingleCollection(problem, positions)
 
 
 class SingleCollection(Collection):

@@ -5,20 +5,18 @@ from __future__ import annotations
 from abc import abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import ClassVar
 
 import torch
-from pydantic import Field
 from tensordict import TensorDict, TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
-from ba_torchrl.algorithms.base import SeedUse, derive_seed
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.envs.faults import MAX_CONSECUTIVE_FAULTS
-from ba_torchrl.training.collectors.base import Collection, CollectionProblem, CollectorConfig
+from ba_torchrl.training.collectors.base import Collection, CollectionProblem
+from ba_torchrl.training.collectors.config import WorkersConfig
 
 VERSION = "policy_version"
 """Key of the updates after which the policy had the weights that chose an action, int64 [1]."""
@@ -59,25 +57,6 @@ class VersionedPolicy(TensorDictModuleBase):
             weights: of the same structure, from `TensorDict.from_module`.
         """
         TensorDict.from_module(self).data.update_(weights)
-
-
-class WorkersConfig(CollectorConfig):
-    """Options of every collector with workers."""
-
-    resources: ClassVar[frozenset[str]] = frozenset({"workers"})
-
-    workers: int = Field(default=2, ge=1)
-    """Number of workers; each runs an equal number of the environments."""
-    steps_per_batch: int = Field(default=1, ge=1)
-    """Steps of each environment between two deliveries of transitions and of weights."""
-
-    def check(self, num_envs: int) -> None:
-        """Raise `ConfigError` unless the workers can share the environments equally."""
-        if num_envs % self.workers:
-            raise ConfigError(
-                f"collector.workers: {self.workers} workers cannot share num_envs={num_envs} "
-                "environments equally"
-            )
 
 
 class WorkerCollection(Collection):

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from ba_torchrl.core.config import LocalPath, StrictModel, parse
+from ba_torchrl.core.config import Chosen, LocalPath, StrictModel, parse
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
@@ -25,6 +25,7 @@ from ba_torchrl.record.results import (
 )
 from ba_torchrl.tasks.base import TASKS, Versions
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS, LauncherConfig
 
 if TYPE_CHECKING:
     from ba_torchrl.algorithms.base import Problem
@@ -68,7 +69,9 @@ class BenchmarkConfig(StrictModel):
     """By network; overrides `per_algorithm`."""
     per_variant: Overrides = Field(default_factory=dict)
     """By variant; overrides `per_network`. "{task}" in ``demonstrations_path`` is the task's id."""
-    launcher: dict[str, Any] = Field(default_factory=lambda: {"name": "local"})
+    launcher: Annotated[LauncherConfig, Chosen(LAUNCHERS)] = Field(
+        default={"name": "local"}, validate_default=True
+    )
     """``name`` of a registered launcher and its options: where the runs take place."""
     jobs: int = Field(default=1, ge=1)
     """Runs at the same time; on a Ray cluster, its resources decide."""
@@ -311,7 +314,7 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
                 cpu = torch.device("cpu")
                 problems[key] = replace(problem, images=images, seed=0, device=cpu)
             problem = problems[key]
-            learner = repr((problem, run.algorithm_config, run.network_config))
+            learner = repr((problem, run.algorithm, run.network))
             if learner not in built:
                 built.add(learner)
                 build_learner(run, problem)

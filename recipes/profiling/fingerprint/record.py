@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import hashlib
 import importlib.metadata
-import json
 import logging
 import multiprocessing
 import os
@@ -309,18 +308,19 @@ def run_gym(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> None:
 
 def _composed(case: Case, run_dir: str) -> dict[str, Any]:
     """Return the values that Hydra composes for a training run."""
-    from hydra import compose, initialize_config_dir
     from omegaconf import OmegaConf
 
-    from ba_torchrl.training import hydra_schema
+    from ba_torchrl.training.presets import composed
 
     overrides = dict(case.config)
     file = overrides.pop("file")
-    lines = [f"{name}={json.dumps(value)}" for name, value in overrides.items()]
-    hydra_schema.register()
-    with initialize_config_dir(str(CONFIGS), version_base="1.3"):
-        settings = compose(file, overrides=[*lines, f"seed={case.seed}", f"run_dir={run_dir}"])
-    return OmegaConf.to_container(settings, resolve=True)
+    overrides |= {"seed": case.seed, "run_dir": run_dir}
+    chosen = [f"{name}={overrides[name]}" for name in overrides if (CONFIGS / name).is_dir()]
+    with composed(CONFIGS, file, chosen) as settings:
+        for name, value in overrides.items():
+            if not (CONFIGS / name).is_dir():
+                OmegaConf.update(settings, name, value)
+        return OmegaConf.to_container(settings, resolve=True)
 
 
 def _flat(values: dict[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
@@ -338,13 +338,13 @@ def run_training(case: Case, facts: dict[str, Any], traces: dict[str, Any]) -> N
     from ba_torchrl.training.experiment import Experiment
 
     with tempfile.TemporaryDirectory() as folder:
-        values = _composed(case, f"{folder}/run")
+        config = ExperimentConfig.parse(_composed(case, f"{folder}/run"))
         facts |= {
             f"config {name}": value
-            for name, value in _flat(values)
+            for name, value in _flat(config.resolved())
             if name.split(".")[0] not in NOT_RECORDED
         }
-        experiment = Experiment(ExperimentConfig.parse(values), progress=False)
+        experiment = Experiment(config, progress=False)
         result = experiment.run()
         with (Path(folder) / "run" / "scalars.csv").open(encoding="utf-8") as file:
             rows = list(csv.DictReader(file))

@@ -3,14 +3,14 @@
 from pathlib import Path
 
 import pytest
-from hydra import compose, initialize_config_dir
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import OmegaConf
 
+from ba_torchrl.commands import benchmark
 from ba_torchrl.core.config import parse
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.modules import EquivariantConfig
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training import hydra_schema
+from ba_torchrl.training import presets
 from ba_torchrl.training.grid.plan import BenchmarkConfig, expand, plan
 from tests.training.grid.grids import PLACE, REACH
 
@@ -19,18 +19,13 @@ ROOT = Path(__file__).parents[3]
 
 
 def shipped(name, *overrides, make_runs=plan):
-    hydra_schema.register()
-    with initialize_config_dir(str(ROOT / "configs"), version_base="1.3"):
-        settings = compose(
-            "benchmark", overrides=[f"benchmark={name}", *overrides], return_hydra_config=True
-        )
-        HydraConfig.instance().set_config(settings)
-        own = OmegaConf.masked_copy(settings, [key for key in settings if key != "hydra"])
-        values = OmegaConf.to_container(own, resolve=True)
+    arguments = benchmark.COMMAND.read([f"benchmark={name}", *overrides])
+    with benchmark.COMMAND.composed(arguments) as settings:
+        values = OmegaConf.to_container(settings, resolve=True)
         assert (values.pop("dry_run"), values.pop("only")) == (False, None)
         known = [name for name in BenchmarkConfig.model_fields if name in values]
         config = parse(BenchmarkConfig, {name: values.pop(name) for name in known}, "benchmark")
-        return config, values, make_runs(config, values, hydra_schema.preset)
+        return config, values, make_runs(config, values, presets.preset)
 
 
 GRIDS = {
@@ -100,10 +95,10 @@ def test_overrides_make_a_small_budget():
     )
     cnn, equi = runs
     assert (cnn.total_updates, cnn.resolved_env.config.obs_size) == (600, 64)
-    assert cnn.network_config.width == 0.5
-    assert {run.network_config.depth_scale_m for run in runs} == {0.1}
-    assert {run.algorithm_config.tau for run in runs} == {0.05}
-    assert equi.network["name"] == "equi"
+    assert cnn.network.width == 0.5
+    assert {run.network.depth_scale_m for run in runs} == {0.1}
+    assert {run.algorithm.tau for run in runs} == {0.05}
+    assert isinstance(equi.network, EquivariantConfig)
     assert cnn.run_dir.startswith("somewhere/")
 
 

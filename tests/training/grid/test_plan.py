@@ -3,6 +3,7 @@
 import pytest
 
 from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.modules import EquivariantConfig
 from ba_torchrl.training.graded import GradedSets
 from tests.training.grid.grids import COMMON, PICK, PLACE, PRESETS, REACH, planned
 
@@ -18,8 +19,8 @@ def test_a_grid_is_the_product_of_its_axes_ordered_by_seed(tmp_path):
     first = runs[0]
     assert (first.task, first.label, first.seed) == (REACH, "sac cnn", 0)
     assert (first.benchmark, first.resume, first.total_updates) == ("little", True, 6)
-    assert first.algorithm_config.replay.name == "uniform"
-    assert first.algorithm_config.batch_size == 8
+    assert first.algorithm.replay.name == "uniform"
+    assert first.algorithm.batch_size == 8
     assert first.run_dir.endswith("grid/close_loop_block_reaching/sac_cnn/seed0")
     assert [run.seed for run in planned(tmp_path, seeds=[7, 3])] == [7, 3]
 
@@ -45,10 +46,10 @@ def test_the_more_specific_override_wins(tmp_path):
     pick = by[PICK, "sacfd small"]
     assert pick.env == {"obs_size": 64, "max_steps": 9}
     assert by[REACH, "sacfd small"].env == {"obs_size": 64, "max_steps": 8}
-    assert (pick.algorithm_config.gamma, pick.algorithm_config.batch_size) == (0.9, 8)
-    assert by[PICK, "sac small"].algorithm_config.gamma == 0.99
-    assert (pick.network_config.width, pick.network_config.depth_scale_m) == (0.5, 0.1)
-    assert by[PICK, "sac cnn"].network_config.width == 1.0
+    assert (pick.algorithm.gamma, pick.algorithm.batch_size) == (0.9, 8)
+    assert by[PICK, "sac small"].algorithm.gamma == 0.99
+    assert (pick.network.width, pick.network.depth_scale_m) == (0.5, 0.1)
+    assert by[PICK, "sac cnn"].network.width == 1.0
     assert PRESETS["network", "small"] == {"name": "cnn", "width": 0.25}
 
 
@@ -56,7 +57,7 @@ def test_another_network_of_one_task_keeps_the_fields_that_it_has(tmp_path):
     own = {"network": {"name": "equi", "n_hidden": 8}}
     common = {"algorithm": {"batch_size": 8, "imitation": {"name": "none"}}}
     (run,) = planned(tmp_path, seeds=1, per_task={REACH: own}, common=common)
-    assert run.network == own["network"]  # without the width of the preset
+    assert run.network == EquivariantConfig(n_hidden=8)  # without the width of the preset
     own["network"]["width"] = 0.5
     with pytest.raises(ConfigError, match="unknown parameter 'width'"):
         planned(tmp_path, seeds=1, per_task={REACH: own}, common=common)

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import ClassVar
 
 from ba_torchrl.core.config import StrictModel
@@ -27,9 +27,16 @@ class Grid:
     """Time limit of each run."""
 
 
-class LauncherConfig(StrictModel, ABC):
-    """Options of a launcher."""
+class LauncherConfig(StrictModel):
+    """Options of a launcher.
 
+    Its module imports no torch: those of this package name in `runner` what runs the grid. Another
+    one can override `run_all` instead.
+    """
+
+    runner: ClassVar[str]
+    """The function that `run_all` imports and calls with the options and the grid, as
+    "module:function"."""
     uses_jobs: ClassVar[bool] = False
     """Whether ``jobs`` runs take place at the same time."""
 
@@ -37,15 +44,15 @@ class LauncherConfig(StrictModel, ABC):
         """Raise `ConfigError` unless the launcher can be used, before anything starts."""
         return
 
-    @abstractmethod
     def run_all(self, grid: Grid) -> dict[Path, str]:
         """Run the unfinished runs of a grid, resume the interrupted ones, and wait for their end.
 
         Returns:
             By run folder, the reason of its failure. Runs that another process runs are left to it.
         """
+        return resolve_name(self.runner)(self, grid)
 
 
 LAUNCHERS: Registry[type[LauncherConfig]] = Registry(
-    "launcher", "ba_torchrl.training.grid.launchers", LauncherConfig
+    "launcher", "ba_torchrl.training.grid.launchers", LauncherConfig, "_config"
 )

@@ -7,93 +7,59 @@ import logging
 import os
 import signal
 import threading
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pydantic import Field
 from tqdm import tqdm
 
-from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.results import FAILURE_FILE
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import LOG_FILE, SAVE_S, record_failure, unfinished
-from ba_torchrl.training.grid.launchers.base import LAUNCHERS, Grid, LauncherConfig
+from ba_torchrl.training.grid.launchers.base import Grid
+from ba_torchrl.training.grid.launchers.ray_config import RayConfig
 from ba_torchrl.training.grid.run_one import run_experiment
 from ba_torchrl.training.interruption import RunStopped
-from ba_torchrl.training.ray_cluster import (
-    check_installed,
-    check_resources,
-    connected_ray,
-    ray_module,
-)
+from ba_torchrl.training.ray_cluster import check_resources, connected_ray, ray_module
 
 _FOREVER_S = 1e6
 
 
-@LAUNCHERS.register("ray")
-class RayConfig(LauncherConfig):
-    """One task of a Ray cluster for each run; as many run at a time as its resources allow.
-
-    All machines see the grid's folder under the same absolute path. A run whose machine or process
-    fails is resumed on another machine from its last saved state.
-    """
-
-    cpus: float = Field(default=1.0, ge=0)
-    """CPU cores that Ray reserves for each run."""
-    gpus: float = Field(default=0.0, ge=0)
-    """GPUs that Ray reserves for each run."""
-    max_retries: int = Field(default=3, ge=0)
-    """Largest number of times that a run is repeated because its machine or process failed."""
-    address: str | None = None
-    """Address of the cluster, such as "auto"; None for `ray.init`'s default, which starts a
-    cluster of this machine if it is not part of one."""
-
-    def check(self, runs: Sequence[ExperimentConfig]) -> None:
-        """Check that Ray is installed, and that no run starts workers of its own on the cluster."""
-        check_installed("launcher")
-        if any(run.collector["name"] == "ray" for run in runs):
-            raise ConfigError(
-                "launcher=ray with collector=ray: runs that hold the cluster would wait for their "
-                "own workers; use one of the two"
-            )
-
-    def run_all(self, grid: Grid) -> dict[Path, str]:
-        """Run the unfinished runs; see `LauncherConfig.run_all`."""
-        waiting = unfinished(grid.runs)
-        ray = connected_ray(self.address)
-        check_resources("launcher", self.cpus, self.gpus)
-        task = ray.remote(
-            num_cpus=self.cpus,
-            num_gpus=self.gpus,
-            max_retries=self.max_retries,
-            max_calls=1,  # a process of its own for each run
-        )(_run_in_task)
-        pending = {}
-        for run in waiting:
-            (run.folder / FAILURE_FILE).unlink(missing_ok=True)
-            where = {"run_dir": str(run.folder.resolve())}
-            values = run.model_copy(update=where).model_dump_json()
-            pending[task.remote(values, grid.max_hours)] = run
-        failures: dict[Path, str] = {}
-        bar = tqdm(total=len(grid.runs), initial=len(grid.runs) - len(waiting), unit="run")
-        try:
-            while pending:
-                for reference in ray.wait(list(pending))[0]:
-                    reason = _reason(reference)
-                    run = pending.pop(reference)
-                    if reason is not None:
-                        failures[run.folder] = reason
-                        record_failure(run, reason)
-                        tqdm.write(f"failed: {run.folder}: {reason}")
-                    bar.update()
-        finally:
-            for reference in pending:  # they save their states
-                ray.cancel(reference)
-            if pending:
-                ray.wait(list(pending), num_returns=len(pending), timeout=SAVE_S)
-            bar.close()
-        return failures
+def run_all(config: RayConfig, grid: Grid) -> dict[Path, str]:
+    """Run the unfinished runs; see `LauncherConfig.run_all`."""
+    waiting = unfinished(grid.runs)
+    ray = connected_ray(config.address)
+    check_resources("launcher", config.cpus, config.gpus)
+    task = ray.remote(
+        num_cpus=config.cpus,
+        num_gpus=config.gpus,
+        max_retries=config.max_retries,
+        max_calls=1,  # a process of its own for each run
+    )(_run_in_task)
+    pending = {}
+    for run in waiting:
+        (run.folder / FAILURE_FILE).unlink(missing_ok=True)
+        where = {"run_dir": str(run.folder.resolve())}
+        values = run.model_copy(update=where).model_dump_json()
+        pending[task.remote(values, grid.max_hours)] = run
+    failures: dict[Path, str] = {}
+    bar = tqdm(total=len(grid.runs), initial=len(grid.runs) - len(waiting), unit="run")
+    try:
+        while pending:
+            for reference in ray.wait(list(pending))[0]:
+                reason = _reason(reference)
+                run = pending.pop(reference)
+                if reason is not None:
+                    failures[run.folder] = reason
+                    record_failure(run, reason)
+                    tqdm.write(f"failed: {run.folder}: {reason}")
+                bar.update()
+    finally:
+        for reference in pending:  # they save their states
+            ray.cancel(reference)
+        if pending:
+            ray.wait(list(pending), num_returns=len(pending), timeout=SAVE_S)
+        bar.close()
+    return failures
 
 
 def _reason(reference: Any) -> str | None:

@@ -1,0 +1,47 @@
+"""Hyper-parameters of the equivariant actor-critic, also with strided convolutions."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from pydantic import Field
+
+from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
+from ba_torchrl.modules.config import NETWORKS
+
+
+@NETWORKS.register("equi")
+class EquivariantConfig(ImageNetworkConfig):
+    """Hyper-parameters of the equivariant actor-critic.
+
+    Args:
+        group_order: number of rotations n of the group, at least 2; the default is that of the
+            reference implementation.
+        reflections: the group is the dihedral group D_n, with n at least 3, instead of the cyclic
+            group C_n.
+        n_hidden: number of regular fields of the last layers; the default is that of the reference
+            implementation. The first layer has an eighth of it
+            at 128 px, and a quarter at 64 px, where the first stage is left out.
+    """
+
+    builder: ClassVar[str] = "ba_torchrl.modules.actor_critic.equivariant:build_equivariant"
+    is_strided: ClassVar[bool] = False
+    """Whether strides take the place of max pools."""
+
+    group_order: int = Field(default=8, ge=2)
+    reflections: bool = False
+    n_hidden: int = Field(default=64, ge=4)
+
+
+@NETWORKS.register("equi_strided")
+class StridedEquivariantConfig(EquivariantConfig):
+    """Hyper-parameters of the equivariant actor-critic with strided convolutions, not max pools.
+
+    Not part of the paper. A 4x4 kernel with stride 2 reads pixels that are symmetric about the
+    centre of the image, so that quarter turns remain exact; a 3x3 kernel with stride 2 does not. It
+    takes four products per input pixel and pair of channels where a 3x3 kernel before a max pool
+    takes nine. The stages, their numbers of fields and the arguments are those of
+    `EquivariantConfig`.
+    """
+
+    is_strided: ClassVar[bool] = True

@@ -1,0 +1,177 @@
+"""Presets: files in ``configs`` that give values of a run a name. Hydra composes them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from hydra import compose, initialize_config_dir
+from hydra.core.config_store import ConfigStore
+from hydra.core.global_hydra import GlobalHydra
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException, MissingConfigException, OverrideParseException
+from omegaconf import DictConfig, OmegaConf
+
+from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS
+from ba_torchrl.core.errors import ConfigError, PartError, SettingsError, UnknownNameError
+from ba_torchrl.training.collectors.config import COLLECTORS
+from ba_torchrl.training.grid.launchers.base import LAUNCHERS
+
+GROUPS = {
+    "algorithm": ALGORITHMS,
+    "network": NETWORKS,
+    "collector": COLLECTORS,
+    "launcher": LAUNCHERS,
+}
+"""By folder of presets in ``configs``, the registry from which they choose."""
+
+_plugin_presets: dict[str, set[str]] = {}
+"""By group, the entries of plugins, which are presets."""
+
+
+@contextmanager
+def started(folder: Path) -> Iterator[None]:
+    """Context in which `preset` reads the presets of a folder, such as ``configs``."""
+    register()
+    with initialize_config_dir(str(folder), version_base="1.3", job_name="ba-torchrl"):
+        yield
+
+
+@contextmanager
+def composed(
+    folder: Path, name: str, overrides: Sequence[str] = (), further: Path | None = None
+) -> Iterator[DictConfig]:
+    """Context, as `started`, with the values of a configuration file.
+
+    Args:
+        folder: of the configuration files.
+        name: of the file.
+        overrides: which presets it takes, in Hydra's grammar, such as ``network=equi``.
+        further: folder of configuration files; its file of that name is taken.
+
+    Raises:
+        ConfigError: there is no such preset, or it cannot be read.
+    """
+    overrides = list(overrides)
+    if further is not None:
+        other = further.resolve()
+        if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
+            folder, other = other, folder
+        path = re.sub(
+            r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", "\\'"), f"file://{other}"
+        )
+        overrides.append(f"hydra.searchpath=['{path}']")
+    with started(folder):
+        try:
+            settings = compose(name, overrides=overrides, return_hydra_config=True)
+        except HydraException as error:
+            raise _explained(error) from None
+        except ValueError as error:  # a preset that is neither a name nor a list
+            raise ConfigError(f"{error}; see --help") from None
+        HydraConfig.instance().set_config(settings)
+        OmegaConf.set_struct(settings, False)  # which settings exist, the models say
+        del settings["hydra"]
+        try:
+            yield settings
+        finally:
+            HydraConfig.instance().cfg = None
+
+
+def register() -> None:
+    """Make the resolvers of ``configs`` known to Hydra, and the presets of plugins.
+
+    An algorithm or another choice from outside the package is a preset under its registered name.
+    """
+    OmegaConf.register_new_resolver(
+        "if_equal",
+        lambda value, other, then, otherwise: then if value == other else otherwise,
+        replace=True,
+    )
+    OmegaConf.register_new_resolver("method", method_name, replace=True)
+    OmegaConf.register_new_resolver(
+        "file_name", lambda text: text.replace("/", "_").replace(" ", "_"), replace=True
+    )
+    for group, registry in GROUPS.items():
+        for name in registry.plugin_names():
+            *folders, last = name.split("/")
+            node = OmegaConf.create({"name": name})
+            where = "/".join([group, *folders])
+            ConfigStore.instance().store(group=where, name=last, node=node, package=group)
+            _plugin_presets.setdefault(group, set()).add(name)
+
+
+def method_name(algorithm: str, replay: str, rotation: str) -> str:
+    """Return the name of a method, such as "sacfd_per_so2": its presets joined by "_", without
+    those of uniform replay and of no rotation."""
+    defaults = ("", "uniform", "none")
+    chosen = zip((algorithm, replay, rotation), defaults, strict=True)
+    return "_".join(name for name, default in chosen if name != default)
+
+
+def preset(group: str, name: str) -> dict[str, Any]:
+    """Return the values of a preset file; Hydra must have been `started`.
+
+    Args:
+        group: folder in ``configs``, such as "algorithm".
+        name: of a file in it, or of a plugin's entry; of the group "algorithm" also of a method, as
+            `method_name` returns it. rad, drq and ferm have no behaviour term if "sac" follows:
+            "rad_sac".
+
+    Raises:
+        UnknownNameError: there is no such preset.
+    """
+    known = preset_names(group)
+    first = max((each for each in known if f"{name}_".startswith(f"{each}_")), key=len, default="")
+    overrides, parts = [f"+{group}={first}"], name.removeprefix(first).split("_")[1:]
+    has_no_behaviour_term = False
+    if first in ("rad", "drq", "ferm") and parts[:1] in (["sac"], ["sacfd"]):
+        has_no_behaviour_term = parts.pop(0) == "sac"
+    for other in ("replay", "rotation") if group == "algorithm" else ():
+        if parts and parts[0] in preset_names(other):
+            overrides.append(f"+{other}={parts.pop(0)}")
+    if not first or parts:
+        raise UnknownNameError(group, name, known)
+    values = OmegaConf.to_container(compose(overrides=overrides)[group], resolve=True)
+    return {**values, "imitation": {"name": "none"}} if has_no_behaviour_term else values
+
+
+def preset_names(group: str) -> list[str]:
+    """Return the names of a group's presets; Hydra must have been `started`."""
+    files = GlobalHydra.instance().config_loader().get_group_options(group)
+    return sorted({*files, *_plugin_presets.get(group, ())})
+
+
+def name_presets(error: ConfigError, settings: DictConfig) -> None:
+    """Let an error on an algorithm or a network have the names of presets, as the user wrote."""
+    choices = HydraConfig.get().runtime.choices
+    if not isinstance(error, PartError | SettingsError) or error.kind not in GROUPS:
+        return
+    if error.kind in choices and settings[error.kind].get("name") == error.name:
+        error.name = choices[error.kind]
+    if isinstance(error, PartError):
+        error.instead = _presets_of(error.kind, error.instead)
+        return
+    fields = {field.split(".")[0] for field, _ in error.problems}
+    for group in ("replay", "rotation"):
+        if group in fields and choices.get(group) not in (None, "uniform", "none"):
+            hint = f"{group}={choices[group]} sets it; this algorithm cannot have it"
+            error.problems.append((group, hint))
+
+
+def _presets_of(group: str, names: Iterable[str]) -> list[str]:
+    """Return the names of the presets whose registered name is one of some names."""
+    return [each for each in preset_names(group) if preset(group, each)["name"] in names]
+
+
+def _explained(error: HydraException) -> ConfigError:
+    """Return an error of Hydra, with the known names if it is about one that is unknown."""
+    first = (str(error) or repr(error.__cause__)).splitlines()[0]
+    if isinstance(error, OverrideParseException):
+        return ConfigError(f"cannot read {error.override!r}: {first}")
+    if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
+        group, _, name = error.missing_cfg_file.rpartition("/")
+        return UnknownNameError(group, name, error.options or ())
+    return ConfigError(first)
