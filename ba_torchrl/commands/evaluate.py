@@ -14,7 +14,6 @@ from ba_torchrl.cli.types import Count, PluginSettings, Seed, Text, VectorSettin
 from ba_torchrl.core.config import FIRST_TEST_SEED, LocalPath, Which
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.record.results import CITABLE_EPISODES, PolicyTest
-from ba_torchrl.record.statistics import wilson
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
@@ -64,6 +63,8 @@ def main(settings: Settings) -> None:
     text = success_text(found.success_rate, found.episodes, policy.task)
     print(f"{text}, {found.mean_length:.1f} steps each")
     if (known := policy.result) is not None:
+        from ba_torchrl.record.statistics import wilson  # imports SciPy
+
         rate, low, high = wilson(known.last.success_rate, known.last.episodes)
         other = "" if known.protocol == PROTOCOL else f", protocol {known.protocol}"
         episodes = f"{known.last.episodes} episodes{other}"
@@ -96,6 +97,8 @@ def play(
 
 def success_text(success_rate: float, episodes: int, task: str) -> str:
     """Return a success rate with its interval in words."""
+    from ba_torchrl.record.statistics import wilson  # imports SciPy
+
     _, low, high = wilson(success_rate, episodes)
     interval = f"95 % interval {low:.2f} to {high:.2f}"
     return f"success_rate {success_rate:.2f} ({interval}) over {episodes} episodes of {task}"
