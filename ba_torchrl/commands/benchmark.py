@@ -41,14 +41,14 @@ class Settings(BenchmarkConfig):
     """Number of the only run to start, from 0 on, in the order of ``dry_run``."""
 
 
-class Task(NamedTuple):
+class PlannedRuns(NamedTuple):
     """A grid and its runs."""
 
     settings: Settings
     runs: list[ExperimentConfig]
 
 
-def parse(values: dict[str, Any], _: Arguments) -> Task:
+def parse(values: dict[str, Any], _: Arguments) -> PlannedRuns:
     """Return the grid with its runs, all of them checked."""
     settings, common = split(values, Settings)
     if not settings.dry_run:
@@ -56,14 +56,14 @@ def parse(values: dict[str, Any], _: Arguments) -> Task:
     runs = plan(settings, common, presets.preset)
     if settings.only is not None and settings.only >= len(runs):
         raise ConfigError(f"only: must be a number from 0 to {len(runs) - 1}, got {settings.only}")
-    return Task(settings, runs)
+    return PlannedRuns(settings, runs)
 
 
-def main(task: Task) -> None:
+def main(planned: PlannedRuns) -> None:
     """Run the unfinished runs of the grid, or list all of them."""
     from ba_torchrl.training.grid.launchers.base import Grid
 
-    config, runs, only = task.settings, task.runs, task.settings.only
+    config, runs, only = planned.settings, planned.runs, planned.settings.only
     if only is not None and not config.dry_run:
         runs = [runs[only]]
     states = [(run, status(run)) for run in runs]

@@ -17,7 +17,7 @@ from torchrl.envs import EnvBase
 from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.collectors.base import CollectionProblem
-from ba_torchrl.training.collectors.ray_config import RayConfig
+from ba_torchrl.training.collectors.ray_config import RayCollectorConfig
 from ba_torchrl.training.collectors.workers import WorkerCollection, failed_too_often
 from ba_torchrl.training.ray_cluster import check_resources, connected_ray, ray_module
 
@@ -25,7 +25,7 @@ _FOREVER = sys.maxsize
 
 
 def start(
-    config: RayConfig, problem: CollectionProblem, _: Sequence[EpisodePosition] | None
+    config: RayCollectorConfig, problem: CollectionProblem, _: Sequence[EpisodePosition] | None
 ) -> RayCollection:
     """Start to collect; see `CollectorConfig.start`. The environments start new episodes."""
     return RayCollection(problem, config)
@@ -46,9 +46,9 @@ class RayCollection(WorkerCollection):
             need.
     """
 
-    config: RayConfig
+    config: RayCollectorConfig
 
-    def __init__(self, problem: CollectionProblem, config: RayConfig) -> None:
+    def __init__(self, problem: CollectionProblem, config: RayCollectorConfig) -> None:
         super().__init__(problem, config)
         connected_ray(config.address)
         check_resources("collector", config.workers * config.cpus, config.workers * config.gpus)

@@ -11,7 +11,7 @@ from ba_torchrl.training.ray_cluster import check_installed
 
 
 @COLLECTORS.register("ray")
-class RayConfig(WorkersConfig):
+class RayCollectorConfig(WorkersConfig):
     """Workers of a Ray cluster, each a Ray actor; they do not wait for each other.
 
     Ray starts a worker of a machine that fails again on another one that has the resources. If a

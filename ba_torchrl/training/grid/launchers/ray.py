@@ -16,7 +16,7 @@ from ba_torchrl.record.results import FAILURE_FILE
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import LOG_FILE, SAVE_S, record_failure, unfinished
 from ba_torchrl.training.grid.launchers.base import Grid
-from ba_torchrl.training.grid.launchers.ray_config import RayConfig
+from ba_torchrl.training.grid.launchers.ray_config import RayLauncherConfig
 from ba_torchrl.training.grid.run_one import run_experiment
 from ba_torchrl.training.interruption import RunStopped
 from ba_torchrl.training.ray_cluster import check_resources, connected_ray, ray_module
@@ -24,7 +24,7 @@ from ba_torchrl.training.ray_cluster import check_resources, connected_ray, ray_
 _FOREVER_S = 1e6
 
 
-def run_all(config: RayConfig, grid: Grid) -> dict[Path, str]:
+def run_all(config: RayLauncherConfig, grid: Grid) -> dict[Path, str]:
     """Run the unfinished runs; see `LauncherConfig.run_all`."""
     waiting = unfinished(grid.runs)
     ray = connected_ray(config.address)

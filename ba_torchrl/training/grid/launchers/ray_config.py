@@ -8,14 +8,14 @@ from typing import ClassVar
 from pydantic import Field
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.training.collectors.ray_config import RayConfig as RayCollector
+from ba_torchrl.training.collectors.ray_config import RayCollectorConfig
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS, LauncherConfig
 from ba_torchrl.training.ray_cluster import check_installed
 
 
 @LAUNCHERS.register("ray")
-class RayConfig(LauncherConfig):
+class RayLauncherConfig(LauncherConfig):
     """One task of a Ray cluster for each run; as many run at a time as its resources allow.
 
     All machines see the grid's folder under the same absolute path. A run whose machine or process
@@ -37,7 +37,7 @@ class RayConfig(LauncherConfig):
     def check(self, runs: Sequence[ExperimentConfig]) -> None:
         """Check that Ray is installed, and that no run starts workers of its own on the cluster."""
         check_installed("launcher")
-        if any(isinstance(run.collector, RayCollector) for run in runs):
+        if any(isinstance(run.collector, RayCollectorConfig) for run in runs):
             raise ConfigError(
                 "launcher=ray with collector=ray: runs that hold the cluster would wait for their "
                 "own workers; use one of the two"
