@@ -1,4 +1,3 @@
-import contextlib
 import functools
 import multiprocessing
 import os
@@ -8,12 +7,7 @@ import threading
 import pytest
 import torch
 
-from ba_torchrl.core.errors import MissingPackageError
 from ba_torchrl.envs.vector.worker import end_with
-from ba_torchrl.modules.steerable.planar_escnn import import_escnn
-
-with contextlib.suppress(MissingPackageError):  # else `importorskip("escnn")` skips its tests
-    import_escnn()
 
 
 def pytest_configure(config):

@@ -201,7 +201,7 @@ def test_the_package_itself_is_light():
     ("parts", "heavy"),
     [
         (("sim", "tasks"), LEARNING),
-        (("envs",), {"escnn", "matplotlib", "hydra", "omegaconf", "imageio_ffmpeg"}),
+        (("envs",), {"matplotlib", "hydra", "omegaconf", "imageio_ffmpeg"}),
     ],
 )
 def test_workers_stay_light(parts, heavy):

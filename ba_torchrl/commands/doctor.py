@@ -15,7 +15,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 from ba_torchrl import __version__
 from ba_torchrl.cli import EXIT_CODE, OF_TRAINING, config_dir
-from ba_torchrl.core.errors import MissingPackageError, install_command
+from ba_torchrl.core.errors import install_command
 from ba_torchrl.core.malloc import tune_malloc
 
 NEEDED = ("torch", "torchrl", "tensordict", "pybullet", "gymnasium", "numpy", "numba", "scipy")
@@ -84,16 +84,6 @@ def _version(name: str) -> str | None:
         return None
 
 
-def _escnn() -> str:
-    from ba_torchrl.modules.steerable.planar_escnn import import_escnn
-
-    try:
-        import_escnn()
-    except MissingPackageError as error:
-        return f"the package's own kernels, as {error.what} (optional)"
-    return _version("escnn") or "without version"
-
-
 def _cpu() -> str:
     import torch
 
@@ -135,7 +125,6 @@ def _policies() -> str:
 
 
 CHECKS = {
-    "escnn": _escnn,
     "cpu": _cpu,
     "networks on the cpu": _cpu_path,
     "gpu": _gpu,

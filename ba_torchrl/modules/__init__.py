@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from ba_torchrl.modules.spatial.rot_fcn import RotFCN
     from ba_torchrl.modules.spatial.rot_fcn_config import RotFCNConfig
     from ba_torchrl.modules.steerable.layers import SteerableConv2d, SteerableLinear
+    from ba_torchrl.modules.steerable.planar import planar_rotations
 
 _MODULES = {
     "ASR": "spatial.asr",
@@ -66,6 +67,7 @@ _MODULES = {
     "SteerableLinear": "steerable.layers",
     "StridedEquivariantConfig": "actor_critic.equivariant_config",
     "evaluation_copy": ".core.evaluation_mode",
+    "planar_rotations": "steerable.planar",
     "spatial_policy": "spatial.policy",
     "squashed_gaussian_policy": "actor_critic.gaussian_policy",
     "truncated_gaussian_policy": "actor_critic.gaussian_policy",
@@ -100,6 +102,7 @@ __all__ = [
     "SteerableLinear",
     "StridedEquivariantConfig",
     "evaluation_copy",
+    "planar_rotations",
     "spatial_policy",
     "squashed_gaussian_policy",
     "truncated_gaussian_policy",

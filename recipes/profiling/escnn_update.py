@@ -22,7 +22,6 @@ from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.equivariant import ActionFields
 from ba_torchrl.modules.actor_critic.gaussian_policy import UnitTanhNormal
 from ba_torchrl.modules.actor_critic.trunk import scale_from_log_std, trunk_stages
-from ba_torchrl.modules.steerable.layers import planar_rotations
 from profiling.learning import (
     CLOSE_LOOP,
     SEED,
@@ -48,9 +47,9 @@ def _convolution(inputs: FieldType, outputs: FieldType, size: int, padding: int 
 
     escnn's own initialisation of a layer of this size takes minutes.
     """
-    from escnn.nn import R2Conv
+    from profiling.planar_escnn import nn as enn
 
-    layer = R2Conv(inputs, outputs, size, padding=padding, initialize=False)
+    layer = enn.R2Conv(inputs, outputs, size, padding=padding, initialize=False)
     with torch.no_grad():
         layer.weights.normal_()
         filters, _ = layer.expand_parameters()
@@ -71,9 +70,9 @@ class Fields:
 
     def of(self, *fields: tuple[Representation, int]) -> FieldType:
         """Return the type of fields, each a representation and its multiplicity."""
-        from escnn.nn import FieldType
+        from profiling.planar_escnn import nn as enn
 
-        return FieldType(self.gspace, [r for r, count in fields for _ in range(count)])
+        return enn.FieldType(self.gspace, [r for r, count in fields for _ in range(count)])
 
     def regular(self, count: int) -> FieldType:
         """Return the type of regular fields."""
@@ -94,7 +93,7 @@ class Trunk(nn.Module):
     """
 
     def __init__(self, fields: Fields, image_size: int, n_hidden: int) -> None:
-        from escnn.nn import PointwiseMaxPool2D, ReLU
+        from profiling.planar_escnn import nn as enn
 
         super().__init__()
         n = n_hidden
@@ -103,9 +102,9 @@ class Trunk(nn.Module):
         stages = trunk_stages(image_size, (n / 8, n / 4, n / 2, n, 2 * n, n, n))
         for width, padding, pools in stages:
             outputs = fields.regular(int(width))
-            layers += [_convolution(inputs, outputs, 3, padding), ReLU(outputs)]
+            layers += [_convolution(inputs, outputs, 3, padding), enn.ReLU(outputs)]
             if pools:
-                layers.append(PointwiseMaxPool2D(outputs, 2))
+                layers.append(enn.PointwiseMaxPool2D(outputs, 2))
             inputs = outputs
         self.layers = nn.ModuleList(layers)
         self.out_type = inputs
@@ -152,7 +151,7 @@ class Critic(nn.Module):
     """
 
     def __init__(self, fields: Fields, image_size: int, n_hidden: int) -> None:
-        from escnn.nn import GroupPooling, ReLU
+        from profiling.planar_escnn import nn as enn
 
         super().__init__()
         self.trunk = Trunk(fields, image_size, n_hidden)
@@ -160,7 +159,7 @@ class Critic(nn.Module):
         regular = self.trunk.out_type
         self.in_type = regular + fields.of(*self.action.types(fields.gspace))
         self.hidden = nn.ModuleList(_convolution(self.in_type, regular, 1) for _ in range(2))
-        self.invariant = nn.Sequential(ReLU(regular), GroupPooling(regular))
+        self.invariant = nn.Sequential(enn.ReLU(regular), enn.GroupPooling(regular))
         invariants, value = fields.trivial(n_hidden), fields.trivial(1)
         self.values = nn.ModuleList(_convolution(invariants, value, 1) for _ in range(2))
 
@@ -187,7 +186,9 @@ class EscnnSACfD:
     def __init__(
         self, group_order: int, image_size: int, n_hidden: int, device: torch.device = CPU
     ) -> None:
-        fields = Fields(planar_rotations(group_order))
+        from profiling.planar_escnn import gspaces
+
+        fields = Fields(gspaces.rot2dOnR2(group_order))
         self.actor = Actor(fields, image_size, n_hidden).to(device)
         self.critic = Critic(fields, image_size, n_hidden).to(device)
         self.target = copy.deepcopy(self.critic).requires_grad_(False)

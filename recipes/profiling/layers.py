@@ -10,8 +10,9 @@ from torch import Tensor
 
 from ba_torchrl.modules.steerable.irrep_convolution import irrep_convolution
 from ba_torchrl.modules.steerable.kernels import regular_irrep_kernels
-from ba_torchrl.modules.steerable.layers import SteerableConv2d, planar_rotations
+from ba_torchrl.modules.steerable.layers import SteerableConv2d
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
+from ba_torchrl.modules.steerable.planar import planar_rotations
 from profiling.learning import LearningUnit
 from profiling.table import Bench, Row, measurement, timed_row
 
@@ -41,12 +42,11 @@ def _rows(bench: Bench, calls: dict[str, Callable[[], None]]) -> list[Row]:
 @measurement("learning/steerable_convolution", over=lambda: FIELDS)
 def measure_steerable(bench: Bench, in_fields: int, out_fields: int, pixels: int) -> list[Row]:
     """A 3x3 steerable convolution of C_8 with the expanded filter and in the basis of irreps."""
-    gspace = planar_rotations(8)
-    regular = gspace.regular_repr
-    layer = SteerableConv2d(gspace, [(regular, in_fields)], [(regular, out_fields)], 3, padding=1)
+    regular = planar_rotations(8).regular_repr
+    layer = SteerableConv2d([(regular, in_fields)], [(regular, out_fields)], 3, padding=1)
     layer.to(bench.device)
     (coefficients,) = layer.coefficients.values()
-    kernels = regular_irrep_kernels(gspace, regular)
+    kernels = regular_irrep_kernels(regular)
     x = torch.randn(BATCH, 8 * in_fields, pixels, pixels, device=bench.device)
 
     def expanded(x: Tensor) -> Tensor:

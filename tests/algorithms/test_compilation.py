@@ -45,7 +45,6 @@ def build(algorithm, network, precision="float32", **settings):
 
 
 def build_spatial(network, sequence):
-    pytest.importorskip("escnn")
     return tiny.build("spatial_q", network, sequence=sequence, sizes=FLOAT32, **SDQFD)
 
 

@@ -15,8 +15,6 @@ from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.modules.actor_critic.cnn import CNNConfig
 from ba_torchrl.modules.base import ActorCritic
 from ba_torchrl.modules.spatial.asr import ASRConfig
-from ba_torchrl.modules.steerable.layers import planar_rotations
-from ba_torchrl.modules.steerable.planar_escnn import import_escnn
 from tests.algorithms.tiny import FERM, SIZES, problem, transitions
 
 
@@ -160,9 +158,8 @@ def test_a_copy_shares_the_parameters_that_a_tensordict_holds():
 
 
 def test_a_copy_of_escnn_layers_has_the_latest_filters():
-    pytest.importorskip("escnn")
-    escnn = import_escnn("escnn.nn")
-    rotations = planar_rotations(4)
+    planar_escnn = pytest.importorskip("profiling.planar_escnn")
+    escnn, rotations = planar_escnn.nn, planar_escnn.gspaces.rot2dOnR2(4)
     one, two = (
         escnn.FieldType(rotations, [each])
         for each in (rotations.trivial_repr, rotations.regular_repr)

@@ -184,7 +184,6 @@ def test_the_host_reads_no_result_during_an_update(algorithm, network, settings)
 )
 def test_losses_of_spatial_networks_read_no_result(network, sequence, kind):
     """Tensors of the device "meta" have no values, and reading one raises an error."""
-    pytest.importorskip("escnn")
     learner = build("spatial_q", network, sequence=sequence, imitation={"name": kind})
     loss = learner.make_loss(learner.make_networks(network_config(network, sequence)).to("meta"))
     terms = loss(transitions(learner, 8).to("meta"))

@@ -6,8 +6,6 @@ import torch
 from tests.algorithms.tiny import SIZES, build, transitions
 from tests.specs import slow_except
 
-pytest.importorskip("escnn")
-
 WIDER = {**{name: {"width": 0.25} for name in SIZES}, "equi": {"group_order": 8, "n_hidden": 16}}
 
 

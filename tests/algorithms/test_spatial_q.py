@@ -72,7 +72,6 @@ def test_every_network_learns_the_demonstrations(network, transitions):
 def test_networks_of_six_degrees_of_freedom_learn_the_demonstrations(
     network, demonstrations, augmentation, pose_episodes
 ):
-    pytest.importorskip("escnn")
     imitation = {"name": demonstrations, "weight": 10.0}
     options = {"imitation": imitation, "rotation": {"name": augmentation}}
     algorithm = build(network, SIX_DOF, optimizer={"learning_rate": 1e-3}, **options)

@@ -37,8 +37,6 @@ def build(network="cnn", vectors=tuple(SIZES), algorithm="sac", observed=SIZES, 
     ],
 )
 def test_updates_and_actions_depend_on_the_vectors(network, vectors, algorithm, settings):
-    if network == "equi":
-        pytest.importorskip("escnn")
     learner = build(network, vectors, algorithm, **settings)
     data = tiny.transitions(learner)
     learner.extend(data)

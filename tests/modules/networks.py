@@ -102,10 +102,3 @@ def turned_pixels(chosen, size, quarters=1):
     position[torch.rot90(numbers, quarters).flatten()] = torch.arange(size * size)
     moved = position[chosen[:, 0] * size + chosen[:, 1]]
     return torch.stack([moved // size, moved % size], dim=1)
-
-
-def equivariant_outputs():
-    """Of small equivariant networks whose weights and inputs are drawn from the same seeds."""
-    heightmap, *others = batch(size=64)
-    actor = actor_critic("equi").actor(heightmap, others[1])
-    return [*actor, *values_of(spatial("equi_asr"), heightmap[..., :32, :32], *others)]

@@ -6,8 +6,6 @@ from itertools import product
 import pytest
 import torch
 
-pytest.importorskip("escnn")
-
 from ba_torchrl.core.errors import ConfigError
 from tests.modules.networks import actor_critic
 from tests.tasks.episodes import slow

@@ -7,17 +7,12 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-pytest.importorskip("escnn")
-
 from ba_torchrl.modules.steerable import cpu_threads
 from ba_torchrl.modules.steerable import irrep_convolution as chunked
 from ba_torchrl.modules.steerable.irrep_convolution import irrep_convolution, saves_time
 from ba_torchrl.modules.steerable.kernels import kernel_block, regular_irrep_kernels
-from ba_torchrl.modules.steerable.layers import (
-    SteerableConv2d,
-    planar_rotations,
-    reuse_filters,
-)
+from ba_torchrl.modules.steerable.layers import SteerableConv2d, reuse_filters
+from ba_torchrl.modules.steerable.planar import planar_rotations
 
 GROUPS = {
     "C4": lambda: planar_rotations(4),
@@ -27,16 +22,16 @@ GROUPS = {
 }
 
 
-def expanded(gspace, coefficients):
-    """The filter as the sum of escnn's kernels."""
-    block = kernel_block(gspace, gspace.regular_repr, gspace.regular_repr, 3)
+def expanded(group, coefficients):
+    """The filter as the sum of the kernels."""
+    block = kernel_block(group.regular_repr, group.regular_repr, 3)
     filters = torch.einsum("oid,dmyxn->ominyx", coefficients, block.kernels.to(coefficients))
     return filters.flatten(0, 1).flatten(1, 2)
 
 
-def check(gspace, in_fields, out_fields, size, padding, batch=5):
-    order = gspace.regular_repr.size
-    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+def check(group, in_fields, out_fields, size, padding, batch=5):
+    order = group.regular_repr.size
+    kernels = regular_irrep_kernels(group.regular_repr)
     x = torch.randn(batch, in_fields * order, *size, requires_grad=True)
     terms = kernels.blocks[0].coupling.shape[0]
     coefficients = torch.randn(out_fields, in_fields, terms, requires_grad=True)
@@ -45,7 +40,7 @@ def check(gspace, in_fields, out_fields, size, padding, batch=5):
     found = irrep_convolution(x, kernels, coefficients, bias, padding)
 
     exact = [tensor.detach().double().requires_grad_() for tensor in inputs]
-    expected = F.conv2d(exact[0], expanded(gspace, exact[1]), exact[2], padding=padding)
+    expected = F.conv2d(exact[0], expanded(group, exact[1]), exact[2], padding=padding)
     assert found.shape == expected.shape
     grad = torch.randn_like(found)
     pairs = [(found, expected)]
@@ -107,16 +102,16 @@ def test_images_larger_than_a_strip():
     ("group", "products", "dense"), [("C4", 36, 144), ("C8", 84, 576), ("D4", 72, 576)]
 )
 def test_products_per_pixel(group, products, dense):
-    gspace = GROUPS[group]()
-    order = gspace.regular_repr.size
-    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    group = GROUPS[group]()
+    order = group.regular_repr.size
+    kernels = regular_irrep_kernels(group.regular_repr)
     assert sum(block.size * block.maps for block in kernels.blocks) == products
     assert 9 * order**2 == dense
 
 
 def test_only_needed_gradients_are_computed():
-    gspace = planar_rotations(4)
-    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    group = planar_rotations(4)
+    kernels = regular_irrep_kernels(group.regular_repr)
     terms = kernels.blocks[0].coupling.shape[0]
     for needs_x, needs_weights in [(True, False), (False, True)]:
         x = torch.randn(2, 8, 6, 6, requires_grad=needs_x)
@@ -126,9 +121,9 @@ def test_only_needed_gradients_are_computed():
 
 
 def test_large_layers_use_it_in_float32(threads):
-    gspace = planar_rotations(8)
-    fields = [(gspace.regular_repr, 32)]
-    layer = SteerableConv2d(gspace, fields, fields, 3, padding=1)
+    group = planar_rotations(8)
+    fields = [(group.regular_repr, 32)]
+    layer = SteerableConv2d(fields, fields, 3, padding=1)
     x = torch.randn(2, 256, 16, 16)
     assert layer._faster_kernels(x) is not None
     weight, bias = layer.expand()
@@ -142,31 +137,31 @@ def test_large_layers_use_it_in_float32(threads):
 
 
 def test_other_inputs_keep_the_expanded_filter():
-    gspace = planar_rotations(4)
-    fields = [(gspace.regular_repr, 64)]
+    group = planar_rotations(4)
+    fields = [(group.regular_repr, 64)]
     x = torch.randn(2, 256, 16, 16)
-    layer = SteerableConv2d(gspace, fields, fields, 3, padding=1)
+    layer = SteerableConv2d(fields, fields, 3, padding=1)
     assert layer(x[:0]).shape == (0, 256, 16, 16)
     with torch.autocast("cpu", torch.bfloat16):
         assert layer(x).dtype == torch.bfloat16
     assert layer.double()(x).dtype == torch.float32
-    padded = SteerableConv2d(gspace, fields, fields, 3, padding=3)
+    padded = SteerableConv2d(fields, fields, 3, padding=3)
     assert padded(x).shape == (2, 256, 20, 20)
-    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    kernels = regular_irrep_kernels(group.regular_repr)
     with pytest.raises(ValueError, match="at most 2"):
         irrep_convolution(x, kernels, next(iter(layer.parameters())), None, 3)
 
 
 def test_small_layers_and_other_fields_keep_the_expanded_filter():
-    gspace = planar_rotations(8)
-    kernels = regular_irrep_kernels(gspace, gspace.regular_repr)
+    group = planar_rotations(8)
+    kernels = regular_irrep_kernels(group.regular_repr)
     for threads in (1, 2):
         assert not saves_time(kernels, (32, 32), 4, 8, 1, threads)
         assert saves_time(kernels, (16, 16), 64, 128, 1, threads)
     assert saves_time(kernels, (32, 32), 8, 16, 1, 1)
     assert not saves_time(kernels, (32, 32), 8, 16, 1, 2)
-    regular, trivial = gspace.regular_repr, gspace.trivial_repr
+    regular, trivial = group.regular_repr, group.trivial_repr
     for fields in ([(trivial, 64)], [(regular, 64), (trivial, 1)]):
-        layer = SteerableConv2d(gspace, fields, [(regular, 64)], 3, padding=1)
+        layer = SteerableConv2d(fields, [(regular, 64)], 3, padding=1)
         channels = sum(rep.size * count for rep, count in fields)
         assert layer._faster_kernels(torch.randn(1, channels, 16, 16)) is None

@@ -13,8 +13,6 @@ from tests.modules.networks import ACTOR_CRITICS, SPATIAL, count, spatial
 from tests.modules.networks import actor_critic as small
 from tests.specs import actor_critic_spec
 
-pytest.importorskip("escnn")
-
 
 @pytest.mark.parametrize(
     ("name", "fields", "actor", "critic"),

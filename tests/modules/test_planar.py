@@ -1,15 +1,11 @@
-"""Steerable kernels of the package beside escnn's."""
+"""Steerable kernels beside escnn's."""
 
+import numpy as np
 import pytest
 import torch
 
-pytest.importorskip("escnn")
-
 from ba_torchrl.modules.steerable.kernels import kernel_block
-from ba_torchrl.modules.steerable.layers import planar_rotations
-from ba_torchrl.modules.steerable.planar import planar_space
-from tests.fresh import run_script
-from tests.modules.networks import equivariant_outputs
+from ba_torchrl.modules.steerable.planar import planar_rotations
 
 
 def representations(space, flips, order):
@@ -20,6 +16,20 @@ def representations(space, flips, order):
     elif order % 2 == 0:
         found["quotient"] = space.quotient_repr(2)
     return found
+
+
+def escnn_kernels(planar_escnn, space, source, target, size):
+    """Return escnn's kernels [D, out, in, K * K] and the basis's description, None if empty."""
+    types = (planar_escnn.nn.FieldType(space, [each]) for each in (source, target))
+    try:
+        layer = planar_escnn.nn.R2Conv(*types, size, initialize=False)
+    except ValueError as error:
+        if "empty" not in str(error):
+            raise
+        return None
+    (kernels,) = (value for name, value in layer.named_buffers() if name.endswith("sampled_basis"))
+    info = list(layer.basisexpansion.get_basis_info())
+    return kernels.reshape(-1, target.size, source.size, size**2), info
 
 
 @pytest.mark.parametrize(
@@ -35,35 +45,43 @@ def representations(space, flips, order):
     ],
 )
 def test_kernels_are_those_of_escnn(order, flips, sizes):
-    """In the same order and with the same signs: weights of policies are their coefficients."""
-    theirs = planar_rotations(order, has_flips=flips)
-    ours = planar_space(order, flips)
-    expected, actual = (representations(space, flips, order) for space in (theirs, ours))
+    """escnn finds those of dihedral groups by a decomposition that leaves their signs open."""
+    planar_escnn = pytest.importorskip("profiling.planar_escnn")
+    gspaces = planar_escnn.gspaces
+    theirs = (gspaces.flipRot2dOnR2 if flips else gspaces.rot2dOnR2)(order)
+    spaces = (theirs, planar_rotations(order, has_flips=flips))
+    expected, actual = (representations(space, flips, order) for space in spaces)
     for name, rep in actual.items():
-        assert (rep.irreps, rep.is_trivial()) == (
-            tuple(expected[name].irreps),
-            expected[name].is_trivial(),
-        )
-        change = torch.from_numpy(expected[name].change_of_basis)
-        torch.testing.assert_close(torch.from_numpy(rep.change_of_basis), change)
+        other = expected[name]
+        assert (rep.irreps, rep.is_trivial()) == (tuple(other.irreps), other.is_trivial())
+        np.testing.assert_allclose(rep.change_of_basis, other.change_of_basis, atol=1e-6)
     for pair in ((first, second) for first in actual for second in actual):
         for size in sizes:
-            found = kernel_block(ours, *(actual[name] for name in pair), size)
-            known = kernel_block(theirs, *(expected[name] for name in pair), size)
-            assert (found is None) == (known is None)
-            if known is not None:
-                assert (found.in_irreps, found.out_irreps) == (known.in_irreps, known.out_irreps)
-                torch.testing.assert_close(found.kernels, known.kernels, atol=1e-5, rtol=1e-5)
+            known = escnn_kernels(planar_escnn, theirs, *(expected[name] for name in pair), size)
+            found = kernel_block(*(actual[name] for name in pair), size)
+            if known is None:
+                assert found is None
+                continue
+            kernels, info = known
+            assert found.in_irreps == tuple(entry["in_irrep"] for entry in info)
+            assert found.out_irreps == tuple(entry["out_irreps_position"] for entry in info)
+            ours = found.kernels.permute(0, 1, 4, 2, 3).flatten(3)
+            signs = (ours * kernels).sum(dim=(1, 2, 3), keepdim=True).sign()
+            assert flips or (signs == 1).all()
+            torch.testing.assert_close(ours, signs * kernels, atol=1e-5, rtol=1e-5)
 
 
-def test_networks_without_escnn_are_those_with_it(tmp_path):
-    torch.save([value.detach() for value in equivariant_outputs()], tmp_path / "expected")
-    code = """
-import sys
-import torch
-sys.modules["escnn"] = None
-from tests.modules.networks import equivariant_outputs
-for found, expected in zip(equivariant_outputs(), torch.load("expected"), strict=True):
-    torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
-"""
-    run_script(tmp_path, code)
+def test_signs_of_dihedral_kernels_are_those_that_policies_were_trained_with():
+    group = planar_rotations(4, has_flips=True)
+    regular, trivial, vector = group.regular_repr, group.trivial_repr, group.irrep(1, 1)
+    sums = []
+    for reps, size in (((trivial, regular), 3), ((regular, regular), 3), ((regular, vector), 1)):
+        kernels = kernel_block(*reps, size).kernels
+        sums.append(float(torch.arange(kernels.numel()).cos() @ kernels.flatten()))
+    assert sums == pytest.approx([1.0364, 3.5929, 1.3485], abs=1e-3)
+
+
+def test_fields_of_two_groups_are_refused():
+    regular, other = planar_rotations(4).regular_repr, planar_rotations(8).regular_repr
+    with pytest.raises(ValueError, match="of one group"):
+        kernel_block(regular, other, 3)

@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-pytest.importorskip("escnn")
-
 from tests.modules.networks import pose, train, turned_pixels, values_of
 from tests.modules.networks import pose_batch as batch
 from tests.tasks.episodes import slow

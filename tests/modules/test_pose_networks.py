@@ -7,8 +7,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-pytest.importorskip("escnn")
-
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.base import scaled_heights, scaled_in_hand
 from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector

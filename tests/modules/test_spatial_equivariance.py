@@ -3,8 +3,6 @@
 import pytest
 import torch
 
-pytest.importorskip("escnn")
-
 from tests.modules.networks import XY, XYR, batch, spatial, train, turned_pixels
 from tests.tasks.episodes import slow
 

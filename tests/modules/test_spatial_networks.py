@@ -8,8 +8,6 @@ import torch
 from pydantic import ValidationError
 from torchrl.objectives import LossModule
 
-pytest.importorskip("escnn")
-
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
 from tests.modules.networks import SPATIAL, XY, XYR, batch, count, values_of

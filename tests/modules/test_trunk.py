@@ -4,8 +4,6 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-pytest.importorskip("escnn")
-
 from tests.modules.networks import actor_critic
 
 WIDTHS = {"equi": {"n_hidden": 16, "group_order": 8}, "cnn": {}, "ferm": {"width": 0.1}}

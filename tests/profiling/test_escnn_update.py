@@ -12,7 +12,7 @@ from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
 from ba_torchrl.objectives.sacfd import SACfDLoss
 from tests.specs import close_loop_images
 
-pytest.importorskip("escnn")
+pytest.importorskip("profiling.planar_escnn")
 
 from profiling import escnn_update
 

@@ -1,14 +1,13 @@
 """The equivariant actor-critic (appendix G.2; "Equi SACfD"), also with strided convolutions.
 
 Turning the scene by +90 degrees about z turns the image by ``torch.rot90(k=1)`` and (dx, dy) into
-(-dy, dx); escnn's rotations have the same sense, so (dx, dy) is a vector field without a change of
-sign. Reflecting the scene's y axis reverses the columns of the image, dy and the yaw.
+(-dy, dx). Rotations of steerable layers have the same sense, so (dx, dy) is a vector field without
+a change of sign. Reflecting the scene's y axis reverses the columns of the image, dy and the yaw.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -24,12 +23,8 @@ from ba_torchrl.modules.steerable.layers import (
     FieldTypes,
     SteerableConv2d,
     SteerableLinear,
-    planar_rotations,
 )
-
-if TYPE_CHECKING:
-    from escnn.group import Representation
-    from escnn.gspaces import GSpace2D
+from ba_torchrl.modules.steerable.planar import PlanarGroup, Representation, planar_rotations
 
 
 class ActionFields:
@@ -61,15 +56,15 @@ class ActionFields:
         self._grouped = [*vector, *self.signed, *self.invariants]
         self._restore = [self._grouped.index(i) for i in range(self.size)]
 
-    def types(self, gspace: GSpace2D, extra_invariants: int = 0) -> FieldTypes:
+    def types(self, group: PlanarGroup, extra_invariants: int = 0) -> FieldTypes:
         """Return the fields [vector, signed, invariants], with extra invariants at the end."""
-        rotation = gspace.irrep(1, 1) if self.has_reflections else gspace.irrep(1)
+        rotation = group.irrep(1, 1) if self.has_reflections else group.irrep(1)
         # A half turn acts on x and y separately, so C_2 needs its one-dimensional irrep twice.
         fields = [(rotation, 2 // rotation.size)]
         if self.signed:
-            fields.append((gspace.irrep(1, 0), len(self.signed)))
+            fields.append((group.irrep(1, 0), len(self.signed)))
         count = len(self.invariants) + extra_invariants
-        return [*fields, (gspace.trivial_repr, count)] if count else fields
+        return [*fields, (group.trivial_repr, count)] if count else fields
 
     def group(self, action: Tensor) -> Tensor:
         """Return the action's components [..., A] as [vector, signed, invariants]."""
@@ -97,12 +92,12 @@ class PoseFields:
         self.center_m = spec.center_m
         self.has_reflections = has_reflections
 
-    def types(self, gspace: GSpace2D) -> FieldTypes:
+    def types(self, group: PlanarGroup) -> FieldTypes:
         """Return the fields [two vectors, two invariants], or none without ``proprio``."""
         if not self.is_observed:
             return []
-        rotation = gspace.irrep(1, 1) if self.has_reflections else gspace.irrep(1)
-        return [(rotation, 4 // rotation.size), (gspace.trivial_repr, 2)]
+        rotation = group.irrep(1, 1) if self.has_reflections else group.irrep(1)
+        return [(rotation, 4 // rotation.size), (group.trivial_repr, 2)]
 
     def fields(self, vectors: tuple[Tensor, ...]) -> tuple[Tensor, ...]:
         """Return the fields [..., 6] of ``proprio`` [..., 8], or nothing of nothing."""
@@ -128,12 +123,12 @@ class EquivariantEncoder(nn.Module):
         return self.trunk(depth, holding, *self.pose.fields(vectors))
 
 
-def steerable_linear(gspace: GSpace2D, inputs: FieldTypes, outputs: FieldTypes) -> nn.Module:
+def steerable_linear(inputs: FieldTypes, outputs: FieldTypes) -> nn.Module:
     """Return a steerable map between vectors of fields, whose inputs may repeat representations."""
     merged: dict[str, tuple[Representation, int]] = {}
     for rep, count in inputs:
         merged[rep.name] = rep, count + merged.get(rep.name, (rep, 0))[1]
-    linear = SteerableLinear(gspace, list(merged.values()), outputs)
+    linear = SteerableLinear(list(merged.values()), outputs)
     if len(merged) == len(inputs):
         return linear
     names = [rep.name for rep, _ in inputs]
@@ -169,7 +164,6 @@ class EquivariantActor(nn.Module):
 
     def __init__(
         self,
-        gspace: GSpace2D,
         trunk: ImageTrunk,
         features: FieldTypes,
         action: ActionFields,
@@ -180,8 +174,8 @@ class EquivariantActor(nn.Module):
         self.action = action
         self.pose = pose
         # The log standard deviations are invariant as well.
-        outputs = action.types(gspace, extra_invariants=action.size)
-        self.head = SteerableLinear(gspace, features, outputs)
+        outputs = action.types(features[0][0].group, extra_invariants=action.size)
+        self.head = SteerableLinear(features, outputs)
 
     def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> tuple[Tensor, Tensor]:
         """Return (loc, scale), each [..., A], of depth [..., C, H, W], holding [..., 1] and, if it
@@ -198,19 +192,18 @@ class EquivariantTwinCritic(nn.Module):
         features: fields of the features, first regular ones.
     """
 
-    def __init__(self, gspace: GSpace2D, features: FieldTypes, action: ActionFields) -> None:
+    def __init__(self, features: FieldTypes, action: ActionFields) -> None:
         super().__init__()
         self.action = action
         regular, count = features[0]
+        group = regular.group
         self._group_order = regular.size
-        inputs = [*features, *action.types(gspace)]
-        self.hidden = nn.ModuleList(
-            steerable_linear(gspace, inputs, [(regular, count)]) for _ in range(2)
-        )
+        inputs = [*features, *action.types(group)]
+        self.hidden = nn.ModuleList(steerable_linear(inputs, [(regular, count)]) for _ in range(2))
         # From invariants to one value: the only steerable kernel is the identity, so this is a
         # plain linear layer.
-        scalars, value = [(gspace.trivial_repr, count)], [(gspace.trivial_repr, 1)]
-        self.values = nn.ModuleList(SteerableLinear(gspace, scalars, value) for _ in range(2))
+        scalars, value = [(group.trivial_repr, count)], [(group.trivial_repr, 1)]
+        self.values = nn.ModuleList(SteerableLinear(scalars, value) for _ in range(2))
 
     def forward(self, features: Tensor, action: Tensor) -> Tensor:
         """Return twin values [..., 2] of features [..., F] and action [..., A]."""
@@ -227,35 +220,29 @@ def build_equivariant(config: EquivariantConfig, spec: ActorCriticSpec) -> Actor
     config.check_images(spec)
     if config.reflections and config.group_order < 3:
         raise ValueError("reflections need a group_order of at least 3")
-    gspace = planar_rotations(config.group_order, has_flips=config.reflections)
+    group = planar_rotations(config.group_order, has_flips=config.reflections)
     action = ActionFields(spec.action_sequence, has_reflections=config.reflections)
     pose = PoseFields(spec, has_reflections=config.reflections)
-    features = [(gspace.regular_repr, config.n_hidden), *pose.types(gspace)]
-    actor = EquivariantActor(gspace, _trunk(config, gspace, spec), features, action, pose)
-    encoder: nn.Module = _trunk(config, gspace, spec)
+    features = [(group.regular_repr, config.n_hidden), *pose.types(group)]
+    actor = EquivariantActor(_trunk(config, group, spec), features, action, pose)
+    encoder: nn.Module = _trunk(config, group, spec)
     return ActorCritic(
         actor=actor,
         encoder=EquivariantEncoder(encoder, pose) if spec.vectors else encoder,
-        critic=_critic(config, gspace, features, action, spec.critics),
+        critic=_critic(features, action, spec.critics),
     )
 
 
-def _critic(
-    config: EquivariantConfig,
-    gspace: GSpace2D,
-    features: FieldTypes,
-    action: ActionFields,
-    critics: int | None,
-) -> nn.Module:
+def _critic(features: FieldTypes, action: ActionFields, critics: int | None) -> nn.Module:
     if critics is None:
-        return EquivariantTwinCritic(gspace, features, action)
-    regular, fields = gspace.regular_repr, config.n_hidden
-    inputs = [*features, *action.types(gspace)]
-    first = steerable_linear(gspace, inputs, [(regular, critics * fields)])
+        return EquivariantTwinCritic(features, action)
+    regular, fields = features[0]
+    inputs = [*features, *action.types(regular.group)]
+    first = steerable_linear(inputs, [(regular, critics * fields)])
     return EnsembleCritic(first, critics, fields, regular.size, action.group)
 
 
-def _trunk(config: EquivariantConfig, gspace: GSpace2D, spec: ActorCriticSpec) -> ImageTrunk:
+def _trunk(config: EquivariantConfig, group: PlanarGroup, spec: ActorCriticSpec) -> ImageTrunk:
     n = config.n_hidden
     stages = trunk_stages(spec.image_size, (n / 8, n / 4, n / 2, n, 2 * n, n, n))
     divisor = round(n / stages[0][0])
@@ -264,13 +251,13 @@ def _trunk(config: EquivariantConfig, gspace: GSpace2D, spec: ActorCriticSpec) -
             f"n_hidden must be a multiple of {divisor} at {spec.image_size} px, since the "
             f"first layer has n_hidden/{divisor} fields; got {n}"
         )
-    regular = gspace.regular_repr
-    fields: FieldTypes = [(gspace.trivial_repr, config.input_channels(spec.image_channels))]
+    regular = group.regular_repr
+    fields: FieldTypes = [(group.trivial_repr, config.input_channels(spec.image_channels))]
     convs = []
     for width, padding, pools in stages:
         out = [(regular, int(width))]
         size, stride = (4, 2) if pools and config.is_strided else (3, 1)
-        convs.append(SteerableConv2d(gspace, fields, out, size, padding=padding, stride=stride))
+        convs.append(SteerableConv2d(fields, out, size, padding=padding, stride=stride))
         fields = out
     pools = [  # a stride halves the image as a pool does
         pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import torch
 import torch.nn.functional as F
@@ -28,14 +28,9 @@ from ba_torchrl.modules.steerable.layers import (
     FilterGenerator,
     SteerableConv2d,
     SteerableLinear,
-    planar_rotations,
-    planar_yaws,
 )
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
-
-if TYPE_CHECKING:
-    from escnn.group import Representation
-    from escnn.gspaces import GSpace2D
+from ba_torchrl.modules.steerable.planar import Representation, planar_rotations, planar_yaws
 
 
 class _Stage(NamedTuple):
@@ -112,7 +107,6 @@ class EquivariantYawValues(XavierInitialised):
 
     def __init__(
         self,
-        gspace: GSpace2D,
         out_repr: Representation,
         spec: SpatialSpec,
         config: EquiASRConfig,
@@ -129,17 +123,18 @@ class EquivariantYawValues(XavierInitialised):
         stages = _TRUNKS[patch_size]
         self.pools = tuple(stage.pools for stage in stages)
         self.convs = nn.ModuleList()
-        types = [(gspace.trivial_repr, 1)]
+        group = out_repr.group
+        types = [(group.trivial_repr, 1)]
         for fields, kernel_size, padding, _ in stages:
             # The last layer keeps its full width in narrow networks: with few fields, all outputs
             # of the dynamic filter can be negative, and the gradient after the ReLU is zero.
             width = config.width if len(self.convs) < len(stages) - 1 else max(config.width, 1.0)
-            out = [(gspace.regular_repr, scaled_width(fields, width))]
-            self.convs.append(SteerableConv2d(gspace, types, out, kernel_size, padding=padding))
+            out = [(group.regular_repr, scaled_width(fields, width))]
+            self.convs.append(SteerableConv2d(types, out, kernel_size, padding=padding))
             types = out
         ((_, fields),) = types
-        self.held = DynamicSteerableConv2d(gspace, gspace.regular_repr, fields, 1)
-        self.values = SteerableLinear(gspace, types, [(out_repr, 2)])
+        self.held = DynamicSteerableConv2d(group.regular_repr, fields, 1)
+        self.values = SteerableLinear(types, [(out_repr, 2)])
 
         narrow, wide = dense_width(config, 512), dense_width(config, 1024)
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
@@ -173,11 +168,11 @@ def pixels_and_yaws(
     config: EquiASRConfig, spec: SpatialSpec, yaw_config: EquiASRConfig, patch_size: int
 ) -> tuple[EquivariantPixelValues, tuple[HeightView, EquivariantYawValues]]:
     """Return the values of the pixels, and those of the yaws with their view."""
-    gspace = planar_rotations(config.group_order, has_flips=True)
-    positions = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, config)
-    gspace, yaw_repr = planar_yaws(config.num_rotations, spec.half_rotation)
+    group = planar_rotations(config.group_order, has_flips=True)
+    positions = EquivariantPixelValues(group.trivial_repr, spec, config)
+    yaw_repr = planar_yaws(config.num_rotations, spec.half_rotation)
     channels = positions.scene_channels
-    yaws = EquivariantYawValues(gspace, yaw_repr, spec, yaw_config, patch_size, channels)
+    yaws = EquivariantYawValues(yaw_repr, spec, yaw_config, patch_size, channels)
     return positions, (HeightView(patch_size), yaws)
 
 

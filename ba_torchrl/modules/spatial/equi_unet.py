@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
 
 import torch
 import torch.nn.functional as F
@@ -25,39 +24,34 @@ from ba_torchrl.modules.steerable.layers import (
     FilterGenerator,
     SteerableConv2d,
 )
-
-if TYPE_CHECKING:
-    from escnn.group import Representation
-    from escnn.gspaces import GSpace2D
+from ba_torchrl.modules.steerable.planar import PlanarGroup, Representation
 
 _FIELDS = (16, 32, 64, 128, 128)
 
 
-def _block(gspace: GSpace2D, fields: int, width: int) -> ResidualBlock:
+def _block(group: PlanarGroup, fields: int, width: int) -> ResidualBlock:
     """Return a residual block of regular fields, with a 3x3 shortcut (1x1 in the plain block)."""
-    regular = gspace.regular_repr
+    regular = group.regular_repr
     inputs, outputs = [(regular, fields)], [(regular, width)]
 
     def conv(types: FieldTypes) -> SteerableConv2d:
-        return SteerableConv2d(gspace, types, outputs, 3, padding=1)
+        return SteerableConv2d(types, outputs, 3, padding=1)
 
     return ResidualBlock(conv(inputs), conv(outputs), None if fields == width else conv(inputs))
 
 
-def equivariant_unet(gspace: GSpace2D, fields: Sequence[int]) -> UNet:
+def equivariant_unet(group: PlanarGroup, fields: Sequence[int]) -> UNet:
     """Return a UNet from one invariant channel to fields[0] regular fields.
 
     Args:
         fields: numbers of regular fields of the five scales, from fine to coarse.
     """
     f1, f2, f4, f8, f16 = fields
-    lift = SteerableConv2d(
-        gspace, [(gspace.trivial_repr, 1)], [(gspace.regular_repr, f1)], 3, padding=1
-    )
-    encoders = [nn.Sequential(lift, nn.ReLU(inplace=True), _block(gspace, f1, f1))]
-    encoders += [_block(gspace, a, b) for a, b in ((f1, f2), (f2, f4), (f4, f8), (f8, f16))]
+    lift = SteerableConv2d([(group.trivial_repr, 1)], [(group.regular_repr, f1)], 3, padding=1)
+    encoders = [nn.Sequential(lift, nn.ReLU(inplace=True), _block(group, f1, f1))]
+    encoders += [_block(group, a, b) for a, b in ((f1, f2), (f2, f4), (f4, f8), (f8, f16))]
     inputs, outputs = (f16 + f8, 2 * f4, 2 * f2, 2 * f1), (f4, f2, f1, f1)
-    return UNet(encoders, [_block(gspace, a, b) for a, b in zip(inputs, outputs, strict=True)])
+    return UNet(encoders, [_block(group, a, b) for a, b in zip(inputs, outputs, strict=True)])
 
 
 class _Head(nn.Module):
@@ -70,15 +64,16 @@ class _Head(nn.Module):
         out_repr: representation of the values; there is a hidden layer only for invariant values.
     """
 
-    def __init__(self, gspace: GSpace2D, fields: int, out_repr: Representation) -> None:
+    def __init__(self, fields: int, out_repr: Representation) -> None:
         super().__init__()
-        types: FieldTypes = [(gspace.regular_repr, fields)]
+        group = out_repr.group
+        types: FieldTypes = [(group.regular_repr, fields)]
         self.hidden = None
         if out_repr.is_trivial():
-            hidden = [(gspace.trivial_repr, max(fields, _FIELDS[0]))]
-            self.hidden = SteerableConv2d(gspace, types, hidden, 3, padding=1)
+            hidden = [(group.trivial_repr, max(fields, _FIELDS[0]))]
+            self.hidden = SteerableConv2d(types, hidden, 3, padding=1)
             types = hidden
-        self.values = SteerableConv2d(gspace, types, [(out_repr, 1)], 1)
+        self.values = SteerableConv2d(types, [(out_repr, 1)], 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return float32 values [B, out, H, W] of x [B, C, H, W]."""
@@ -99,7 +94,6 @@ class EquivariantPixelValues(nn.Module):
 
     def __init__(
         self,
-        gspace: GSpace2D,
         out_repr: Representation,
         spec: SpatialSpec,
         config: SpatialImageConfig,
@@ -107,17 +101,17 @@ class EquivariantPixelValues(nn.Module):
         super().__init__()
         self.config = config
         fields = [scaled_width(f, config.width) for f in _FIELDS]
-        regular = gspace.regular_repr
+        regular = out_repr.group.regular_repr
         self._group_size = regular.size
         self.scene_channels = fields[-1]
         wide = dense_width(config, 1024)
         self.hand = InHandVector(spec.in_hand_channels, spec.in_hand_size, config.width, wide)
         self.hand.reset_parameters()
-        self.unet = equivariant_unet(gspace, fields)
-        self.held = DynamicSteerableConv2d(gspace, regular, fields[0], 3)
+        self.unet = equivariant_unet(out_repr.group, fields)
+        self.held = DynamicSteerableConv2d(regular, fields[0], 3)
         self.coefficients = FilterGenerator(self.hand.out_features, self.held)
-        self.pick = _Head(gspace, fields[0], out_repr)
-        self.place = _Head(gspace, fields[0], out_repr)
+        self.pick = _Head(fields[0], out_repr)
+        self.place = _Head(fields[0], out_repr)
 
     def forward(self, heightmap: Tensor, in_hand: Tensor, holding: Tensor) -> tuple[Tensor, Tensor]:
         """Return values and the invariant bottleneck map.

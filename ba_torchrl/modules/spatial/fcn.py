@@ -16,7 +16,7 @@ from ba_torchrl.modules.spatial.base import (
 from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
 from ba_torchrl.modules.spatial.fcn_config import EquiFCNConfig, FCNConfig
 from ba_torchrl.modules.spatial.unet import PlainPixelValues
-from ba_torchrl.modules.steerable.layers import planar_rotations, planar_yaws
+from ba_torchrl.modules.steerable.planar import planar_rotations, planar_yaws
 
 _DEFAULT_GROUP_ORDER = 4
 
@@ -56,11 +56,11 @@ def build_equi_fcn(config: EquiFCNConfig, spec: SpatialSpec) -> FCN:
     yaw = has_yaw("equi_fcn", spec)
     require_unet_size("equi_fcn", spec.image_size)
     if not yaw:
-        gspace = planar_rotations(config.group_order or _DEFAULT_GROUP_ORDER, has_flips=True)
-        values = EquivariantPixelValues(gspace, gspace.trivial_repr, spec, config)
+        group = planar_rotations(config.group_order or _DEFAULT_GROUP_ORDER, has_flips=True)
+        values = EquivariantPixelValues(group.trivial_repr, spec, config)
         return FCN(values, spec.image_size, None)
     if config.group_order is not None:
         raise ValueError("num_rotations sets the group of 'equi_fcn': leave out group_order")
-    gspace, yaws = planar_yaws(config.num_rotations, spec.half_rotation)
-    values = EquivariantPixelValues(gspace, yaws, spec, config)
+    yaws = planar_yaws(config.num_rotations, spec.half_rotation)
+    values = EquivariantPixelValues(yaws, spec, config)
     return FCN(values, spec.image_size, config.num_rotations)

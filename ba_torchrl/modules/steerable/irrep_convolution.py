@@ -14,7 +14,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -27,9 +27,7 @@ from ba_torchrl.modules.steerable.irrep_maps import (
     to_elements,
     to_irreps,
 )
-
-if TYPE_CHECKING:
-    from escnn.group import Representation
+from ba_torchrl.modules.steerable.planar import Representation
 
 CHUNK_BYTES = 1_500_000
 """Largest size of the maps of a group, so that they stay in the second cache."""

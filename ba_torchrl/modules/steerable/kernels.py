@@ -1,15 +1,13 @@
-"""Bases of steerable kernels, of escnn or `planar`, and scales of their initial coefficients."""
+"""Bases of steerable kernels as tensors, and scales of their initial coefficients."""
 
 from __future__ import annotations
 
-import contextlib
-import io
 import math
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,14 +15,9 @@ from torch import Tensor
 
 from ba_torchrl.modules.layers import can_be_kept, real_tensors
 from ba_torchrl.modules.steerable.irrep_convolution import IrrepKernels, irrep_kernels
-from ba_torchrl.modules.steerable.planar import PlanarSpace, sampled_kernels
-from ba_torchrl.modules.steerable.planar_escnn import import_escnn
+from ba_torchrl.modules.steerable.planar import Representation, sampled_kernels
 
-if TYPE_CHECKING:
-    from escnn.group import Representation
-    from escnn.gspaces import GSpace2D
-
-FieldTypes = Sequence[tuple["Representation", int]]
+FieldTypes = Sequence[tuple[Representation, int]]
 """Representations with their multiplicities, in the order of the channels."""
 
 
@@ -33,7 +26,7 @@ class KernelBlock:
     """The steerable kernels between one input and one output representation.
 
     Args:
-        kernels: float32 [D, O, K, K, I], escnn's normalised basis, input channels last.
+        kernels: float32 [D, O, K, K, I], normalised, input channels last.
         in_irreps: for each of the D kernels, the input irrep that it reads.
         out_irreps: for each kernel, the index of the output irrep that it writes.
     """
@@ -64,53 +57,31 @@ class KernelBlock:
 @cache
 @real_tensors()
 def kernel_block(
-    gspace: GSpace2D | PlanarSpace,
-    in_repr: Representation,
-    out_repr: Representation,
-    kernel_size: int,
+    in_repr: Representation, out_repr: Representation, kernel_size: int
 ) -> KernelBlock | None:
     """Return the kernels between two representations, None if there are none.
 
     Built once per process: the construction takes up to a second for large groups.
     """
-    if isinstance(gspace, PlanarSpace):
-        found = sampled_kernels(in_repr, out_repr, kernel_size)
-        if not found:
-            return None
-        kernels = torch.tensor(np.stack([kernel.values for kernel in found]), dtype=torch.float32)
-        kernels = kernels.unflatten(-1, (kernel_size, kernel_size)).permute(0, 1, 3, 4, 2)
-        return KernelBlock(
-            kernels=kernels.contiguous(),
-            in_irreps=tuple(kernel.in_irrep for kernel in found),
-            out_irreps=tuple(kernel.out_index for kernel in found),
-        )
-    nn = import_escnn("escnn.nn")
-    types = nn.FieldType(gspace, [in_repr]), nn.FieldType(gspace, [out_repr])
-    try:
-        with contextlib.redirect_stdout(io.StringIO()):  # escnn prints when the basis is empty
-            layer = nn.R2Conv(*types, kernel_size, initialize=False)
-    except ValueError as error:
-        if "basis" in str(error) and "empty" in str(error):
-            return None  # for example trivial to vector with a 1x1 kernel
-        raise
-    expansion = layer.basisexpansion
-    # One pair of representations has one buffer. Expanding unit vectors gives the same numbers, but
-    # takes almost a minute for 7x7 kernels of C_32.
-    (kernels,) = (v for n, v in expansion.named_buffers() if n.endswith("sampled_basis"))
-    shape = (-1, out_repr.size, in_repr.size, kernel_size, kernel_size)
-    info = list(expansion.get_basis_info())
+    if in_repr.group is not out_repr.group:
+        raise ValueError("input and output fields must be of one group of `planar_rotations`")
+    found = sampled_kernels(in_repr, out_repr, kernel_size)
+    if not found:
+        return None  # for example trivial to vector with a 1x1 kernel
+    kernels = torch.tensor(np.stack([kernel.values for kernel in found]), dtype=torch.float32)
+    kernels = kernels.unflatten(-1, (kernel_size, kernel_size)).permute(0, 1, 3, 4, 2)
     return KernelBlock(
-        kernels=kernels.reshape(shape).permute(0, 1, 3, 4, 2).contiguous().float(),
-        in_irreps=tuple(entry["in_irrep"] for entry in info),
-        out_irreps=tuple(entry["out_irreps_position"] for entry in info),
+        kernels=kernels.contiguous(),
+        in_irreps=tuple(kernel.in_irrep for kernel in found),
+        out_irreps=tuple(kernel.out_index for kernel in found),
     )
 
 
 @cache
 @real_tensors()
-def regular_irrep_kernels(gspace: GSpace2D, rep: Representation) -> IrrepKernels | None:
+def regular_irrep_kernels(rep: Representation) -> IrrepKernels | None:
     """Return the 3x3 kernels between fields of a representation in the basis of irreps."""
-    block = kernel_block(gspace, rep, rep, 3)
+    block = kernel_block(rep, rep, 3)
     return None if block is None else irrep_kernels(rep, block.kernels, block.in_irreps)
 
 
@@ -151,10 +122,10 @@ def bias_block(out_types: FieldTypes) -> KernelBlock:
     start = 0
     for rep, count in out_types:
         position, trivial = 0, []
-        for irrep in (rep.group.irrep(*name) for name in rep.irreps):
-            if irrep.is_trivial():
+        for name in rep.irreps:
+            if not any(name):
                 trivial.append(torch.tensor(rep.change_of_basis[:, position], dtype=torch.float32))
-            position += irrep.size
+            position += rep.group.irrep_size(name)
         for _ in range(count):
             for values in trivial:
                 column = torch.zeros(channels)

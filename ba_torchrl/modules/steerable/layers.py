@@ -1,9 +1,8 @@
-"""Steerable convolutions on escnn's kernel bases, with plain tensors in and out.
+"""Steerable convolutions with plain tensors in and out.
 
-escnn builds the bases, or `planar` where it is not installed; the layers here hold the
-coefficients and expand them in every forward pass, or once inside `reuse_filters`. Outside of it no
-filter is kept, so none is outdated when weights are copied in place, and ``state_dict``,
-``deepcopy`` and functional calls see ordinary parameters only.
+The layers hold the coefficients of the kernels and expand them in every forward pass, or once
+inside `reuse_filters`. Outside of it no filter is kept, so none is outdated when weights are copied
+in place, and ``state_dict``, ``deepcopy`` and functional calls see ordinary parameters only.
 """
 
 from __future__ import annotations
@@ -11,13 +10,12 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from contextvars import ContextVar
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from ba_torchrl.core.errors import MissingPackageError
 from ba_torchrl.modules.layers import can_be_kept
 from ba_torchrl.modules.steerable.cpu_threads import is_plain_float32
 from ba_torchrl.modules.steerable.irrep_convolution import (
@@ -32,12 +30,7 @@ from ba_torchrl.modules.steerable.kernels import (
     kernel_block,
     regular_irrep_kernels,
 )
-from ba_torchrl.modules.steerable.planar import PlanarSpace, planar_space
-from ba_torchrl.modules.steerable.planar_escnn import import_escnn
-
-if TYPE_CHECKING:
-    from escnn.group import Representation
-    from escnn.gspaces import GSpace2D
+from ba_torchrl.modules.steerable.planar import Representation
 
 _expanded: ContextVar[dict[tuple[Any, ...], tuple[Any, ...]] | None] = ContextVar(
     "expanded", default=None
@@ -63,42 +56,15 @@ def reuse_filters() -> Iterator[None]:
         _expanded.reset(token)
 
 
-def planar_rotations(order: int, *, has_flips: bool = False) -> GSpace2D | PlanarSpace:
-    """Return the space of planar images under the cyclic group C_order, or the dihedral D_order.
-
-    It is escnn's, or where escnn is not installed one of the same representations.
-    """
-    try:
-        gspaces = import_escnn("escnn.gspaces")
-    except MissingPackageError:
-        return planar_space(order, has_flips)
-    return (gspaces.flipRot2dOnR2 if has_flips else gspaces.rot2dOnR2)(order)
-
-
-def planar_yaws(count: int, half_rotation: bool) -> tuple[GSpace2D, Representation]:
-    """Return the planar rotations, and the representation of the values of ``count`` yaws.
-
-    A rotation by one step moves every value to the next yaw. If yaws half a turn apart are
-    equivalent, the steps generate C_2count and half a turn leaves the values unchanged, which is
-    the quotient representation C_2count / C_2. Otherwise it is the regular representation of
-    C_count.
-    """
-    if half_rotation:
-        gspace = planar_rotations(2 * count)
-        return gspace, gspace.quotient_repr(2)
-    gspace = planar_rotations(count)
-    return gspace, gspace.regular_repr
-
-
 class SteerableConv2d(nn.Module):
     """A convolution whose filter is a learnt combination of steerable kernels.
 
-    Numerically it is escnn's ``R2Conv`` with default bands. Equivariant under the rotations of
-    ``gspace``, exactly so for multiples of 90 degrees if the pixels that ``stride`` reads have that
-    symmetry.
+    Numerically it is escnn's ``R2Conv`` with default bands. Equivariant under the fields' group,
+    exactly so for multiples of 90 degrees if the pixels that ``stride`` reads have that symmetry.
 
     Args:
-        in_types: input fields as (representation, multiplicity); each representation once.
+        in_types: input fields as (representation, multiplicity); each representation once. The
+            representations are those of a group of `planar_rotations`.
         out_types: output fields likewise.
         padding: zeros added on each side, pixels.
         stride: distance between output pixels, in input pixels.
@@ -106,7 +72,6 @@ class SteerableConv2d(nn.Module):
 
     def __init__(
         self,
-        gspace: GSpace2D,
         in_types: FieldTypes,
         out_types: FieldTypes,
         kernel_size: int,
@@ -128,7 +93,7 @@ class SteerableConv2d(nn.Module):
         self._in = [(rep.size, count) for rep, count in in_types]
         self._out = [(rep.size, count) for rep, count in out_types]
         found = {
-            (i, o): kernel_block(gspace, in_repr, out_repr, kernel_size)
+            (i, o): kernel_block(in_repr, out_repr, kernel_size)
             for i, (in_repr, _) in enumerate(in_types)
             for o, (out_repr, _) in enumerate(out_types)
         }
@@ -152,7 +117,7 @@ class SteerableConv2d(nn.Module):
             ((in_repr, _), *others), ((out_repr, _), *other_outputs) = in_types, out_types
             is_small = in_repr.size <= 8  # kernels of large groups take seconds to convert
             if in_repr is out_repr and is_small and not others and not other_outputs:
-                self._irrep_kernels = regular_irrep_kernels(gspace, in_repr)
+                self._irrep_kernels = regular_irrep_kernels(in_repr)
         self._bias_block = bias_block(out_types)
         count = len(self._bias_block.kernels)
         self.bias = nn.Parameter(torch.empty(count)) if count else None
@@ -263,8 +228,8 @@ class SteerableConv2d(nn.Module):
 class SteerableLinear(SteerableConv2d):
     """The steerable map between vectors of fields: a one-pixel `SteerableConv2d`."""
 
-    def __init__(self, gspace: GSpace2D, in_types: FieldTypes, out_types: FieldTypes) -> None:
-        super().__init__(gspace, in_types, out_types, 1)
+    def __init__(self, in_types: FieldTypes, out_types: FieldTypes) -> None:
+        super().__init__(in_types, out_types, 1)
 
     def forward(self, x: Tensor) -> Tensor:
         """Return [..., out] of x [..., in]."""
@@ -287,11 +252,9 @@ class DynamicSteerableConv2d(nn.Module):
         kernel_size: pixels; the map keeps its size.
     """
 
-    def __init__(
-        self, gspace: GSpace2D, representation: Representation, count: int, kernel_size: int
-    ) -> None:
+    def __init__(self, representation: Representation, count: int, kernel_size: int) -> None:
         super().__init__()
-        block = kernel_block(gspace, representation, representation, kernel_size)
+        block = kernel_block(representation, representation, kernel_size)
         assert block is not None  # the identity is always one of them
         self._block = block
         self.count, self.size, self.kernel_size = count, representation.size, kernel_size

@@ -1,10 +1,10 @@
 """Kernels that are steerable under the rotations, or rotations and reflections, of the plane.
 
-They are escnn's, in its order and with its signs, for where escnn is not installed. An equivariant
-kernel K from a field of the representation r to one of s fulfils K(g x) = s(g) K(x) r(g)^-1 (Weiler
-and Cesa, "General E(2)-Equivariant Steerable CNNs", 2019). Between irreps it is a sum over circular
-harmonics, which couple to both by Clebsch-Gordan coefficients (Cesa, Lang and Weiler, "A Program to
-Build E(N)-Equivariant Steerable CNNs", 2022, theorem 2.1).
+An equivariant kernel K from a field of the representation r to one of s fulfils
+K(g x) = s(g) K(x) r(g)^-1 (Weiler and Cesa, "General E(2)-Equivariant Steerable CNNs", 2019).
+Between irreps it is a sum over circular harmonics, which couple to both by Clebsch-Gordan
+coefficients (Cesa, Lang and Weiler, "A Program to Build E(N)-Equivariant Steerable CNNs", 2022,
+theorem 2.1). Order and signs of the kernels are escnn's; a policy's weights are their coefficients.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ _LEAST_NORM = 1e-2
 
 @dataclass(frozen=True, eq=False)
 class PlanarGroup:
-    """The cyclic group of ``order`` rotations, or with ``has_flips`` the dihedral group."""
+    """The cyclic group of ``order`` rotations, or with ``has_flips`` the dihedral group.
+
+    Use `planar_rotations`, which returns one object for each group.
+    """
 
     order: int
     has_flips: bool
@@ -41,7 +44,7 @@ class PlanarGroup:
         return [(flip, step) for flip in flips for step in range(self.order)]
 
     @cached_property
-    def irreps(self) -> dict[IrrepId, PlanarRepresentation]:
+    def irreps(self) -> dict[IrrepId, Representation]:
         """The irreducible representations, by id."""
         most = self.order // 2
         ids: list[IrrepId] = [(k,) for k in range(most + 1)]
@@ -49,15 +52,46 @@ class PlanarGroup:
             ids = [(0, 0), *((1, k) for k in range(most + 1))]
             ids += [] if self.order % 2 else [(0, most)]
         return {
-            each: PlanarRepresentation(
+            each: Representation(
                 self, "irrep_" + ",".join(map(str, each)), (each,), np.eye(self.irrep_size(each))
             )
             for each in dict.fromkeys(ids)
         }
 
-    def irrep(self, *name: int) -> PlanarRepresentation:
+    def irrep(self, *name: int) -> Representation:
         """Return an irreducible representation."""
         return self.irreps[name]
+
+    @property
+    def trivial_repr(self) -> Representation:
+        """The trivial representation."""
+        return next(iter(self.irreps.values()))
+
+    @cached_property
+    def regular_repr(self) -> Representation:
+        """The permutations of the group's elements."""
+        return self._permutations("regular", self.elements, list(self.irreps))
+
+    @cache  # noqa: B019 - groups are kept as well
+    def quotient_repr(self, order: int) -> Representation:
+        """Return the permutations of the cosets of the rotations of a lower order."""
+        if self.has_flips or self.order % order:
+            raise ValueError(f"no cosets of {order} rotations among {self.order}")
+        irreps = [name for name in self.irreps if name[-1] % order == 0]
+        return self._permutations(f"quotient_{order}", self.elements[: self.order // order], irreps)
+
+    def _permutations(
+        self, name: str, elements: Sequence[tuple[int, int]], irreps: Sequence[IrrepId]
+    ) -> Representation:
+        columns, names = [], []
+        for irrep in irreps:
+            size = self.irrep_size(irrep)
+            copies = size if self.has_flips else 1
+            names += [irrep] * copies
+            for copy in range(copies):
+                values = [self.matrix(irrep, element)[:, copy] for element in elements]
+                columns.append(np.array(values) * np.sqrt(size / len(elements)))
+        return Representation(self, name, tuple(names), np.concatenate(columns, axis=1))
 
     def irrep_size(self, name: IrrepId) -> int:
         """Return the dimension of an irrep."""
@@ -148,7 +182,7 @@ def _rotation(angle_rad: float) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class PlanarRepresentation:
+class Representation:
     """A representation of a group of the plane.
 
     Args:
@@ -171,54 +205,34 @@ class PlanarRepresentation:
         return self.size == 1 and not any(self.irreps[0])
 
 
-@dataclass(frozen=True, eq=False)
-class PlanarSpace:
-    """Planar images under a group, with the names of escnn's ``GSpace2D``."""
+def planar_rotations(order: int, *, has_flips: bool = False) -> PlanarGroup:
+    """Return the cyclic group C_order of planar rotations, or the dihedral group D_order.
 
-    fibergroup: PlanarGroup
-
-    def irrep(self, *name: int) -> PlanarRepresentation:
-        """Return an irreducible representation of the group."""
-        return self.fibergroup.irrep(*name)
-
-    @property
-    def trivial_repr(self) -> PlanarRepresentation:
-        """The trivial representation."""
-        return next(iter(self.fibergroup.irreps.values()))
-
-    @cached_property
-    def regular_repr(self) -> PlanarRepresentation:
-        """The permutations of the group's elements."""
-        return self._permutations("regular", self.fibergroup.elements, list(self.fibergroup.irreps))
-
-    @cache  # noqa: B019 - spaces are kept as well
-    def quotient_repr(self, order: int) -> PlanarRepresentation:
-        """Return the permutations of the cosets of the rotations of a lower order."""
-        group = self.fibergroup
-        if group.has_flips or group.order % order:
-            raise ValueError(f"no cosets of {order} rotations among {group.order}")
-        elements = group.elements[: group.order // order]
-        irreps = [name for name in group.irreps if name[-1] % order == 0]
-        return self._permutations(f"quotient_{order}", elements, irreps)
-
-    def _permutations(
-        self, name: str, elements: Sequence[tuple[int, int]], irreps: Sequence[IrrepId]
-    ) -> PlanarRepresentation:
-        group, columns, names = self.fibergroup, [], []
-        for irrep in irreps:
-            size = group.irrep_size(irrep)
-            copies = size if group.has_flips else 1
-            names += [irrep] * copies
-            for copy in range(copies):
-                values = [group.matrix(irrep, element)[:, copy] for element in elements]
-                columns.append(np.array(values) * np.sqrt(size / len(elements)))
-        return PlanarRepresentation(group, name, tuple(names), np.concatenate(columns, axis=1))
+    Examples:
+        >>> import torch
+        >>> from ba_torchrl.modules import SteerableConv2d, planar_rotations
+        >>> c8 = planar_rotations(8)
+        >>> layer = SteerableConv2d([(c8.trivial_repr, 1)], [(c8.regular_repr, 2)], kernel_size=3)
+        >>> layer(torch.rand(1, 1, 5, 5)).shape
+        torch.Size([1, 16, 3, 3])
+    """
+    return _group(order, has_flips)
 
 
-@cache
-def planar_space(order: int, has_flips: bool) -> PlanarSpace:
-    """Return planar images under rotations by 1 / order of a turn, perhaps with reflections."""
-    return PlanarSpace(PlanarGroup(order, has_flips))
+_group = cache(PlanarGroup)
+
+
+def planar_yaws(count: int, half_rotation: bool) -> Representation:
+    """Return the representation of the values of ``count`` yaws under planar rotations.
+
+    A rotation by one step moves every value to the next yaw. If yaws half a turn apart are
+    equivalent, the steps generate C_2count and half a turn leaves the values unchanged, which is
+    the quotient representation C_2count / C_2. Otherwise it is the regular representation of
+    C_count.
+    """
+    if half_rotation:
+        return planar_rotations(2 * count).quotient_repr(2)
+    return planar_rotations(count).regular_repr
 
 
 class SampledKernel(NamedTuple):
@@ -236,7 +250,7 @@ class SampledKernel(NamedTuple):
 
 
 def sampled_kernels(
-    source: PlanarRepresentation, target: PlanarRepresentation, kernel_size: int
+    source: Representation, target: Representation, kernel_size: int
 ) -> list[SampledKernel]:
     """Return the steerable kernels from one representation to another, normalised.
 
@@ -267,7 +281,7 @@ def sampled_kernels(
     return found
 
 
-def _positions(representation: PlanarRepresentation) -> Iterator[tuple[int, IrrepId]]:
+def _positions(representation: Representation) -> Iterator[tuple[int, IrrepId]]:
     """Yield the first row and the id of each irrep."""
     row = 0
     for name in representation.irreps:

@@ -41,7 +41,7 @@ NOT_RECORDED = ("run_dir", "resume", "label")
 """Fields of a run's configuration that do not affect its numbers."""
 WORDS = 12
 """Words of an error's message that are recorded."""
-LIBRARIES = ("torch", "torchrl", "tensordict", "numpy", "pybullet", "numba", "scipy", "escnn")
+LIBRARIES = ("torch", "torchrl", "tensordict", "numpy", "pybullet", "numba", "scipy")
 """Packages whose versions the numbers depend on."""
 
 
