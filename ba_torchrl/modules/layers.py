@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
-from torch.utils._python_dispatch import _disable_current_modes
 
 from ba_torchrl.core import hardware
 from ba_torchrl.core.choices import Precision
@@ -19,15 +18,19 @@ from ba_torchrl.core.choices import Precision
 Value = TypeVar("Value")
 
 
-@contextlib.contextmanager
-def real_tensors() -> Iterator[None]:
-    """Context that makes tensors for the whole process, whatever the caller's context is.
+def real_tensors(function: Callable[..., Value]) -> Callable[..., Value]:
+    """Decorate a function whose tensors are for the whole process.
 
-    New tensors are on the CPU and have values; they are not those of a `torch.device` context, of
-    an export's fake tensors or of `torch.inference_mode`. Also a decorator.
+    They are on the CPU and have values, whatever the caller's context is: a new thread is in no
+    `torch.device` context, fake mode of an export, transform or `torch.inference_mode`.
     """
-    with torch.inference_mode(False), torch.device("cpu"), _disable_current_modes():
-        yield
+
+    @wraps(function)
+    def call(*args: Any) -> Value:
+        with ThreadPoolExecutor(1) as thread:
+            return thread.submit(function, *args).result()
+
+    return call
 
 
 def can_be_kept(value: object) -> bool:

@@ -55,7 +55,7 @@ class KernelBlock:
 
 
 @cache
-@real_tensors()
+@real_tensors
 def kernel_block(
     in_repr: Representation, out_repr: Representation, kernel_size: int
 ) -> KernelBlock | None:
@@ -78,7 +78,7 @@ def kernel_block(
 
 
 @cache
-@real_tensors()
+@real_tensors
 def regular_irrep_kernels(rep: Representation) -> IrrepKernels | None:
     """Return the 3x3 kernels between fields of a representation in the basis of irreps."""
     block = kernel_block(rep, rep, 3)
@@ -114,7 +114,7 @@ def he_scales(
     }
 
 
-@real_tensors()
+@real_tensors
 def bias_block(out_types: FieldTypes) -> KernelBlock:
     """Return the kernels [biases, channels] of biases, which act on trivial irreps, mapped into the
     bases of their fields."""
