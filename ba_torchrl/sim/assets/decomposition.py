@@ -134,20 +134,16 @@ def _volume(mesh: Mesh) -> float:
 def _joined(mesh: Mesh) -> Mesh:
     """Return a surface with one vertex for each position, without copies of a face, whose faces
     point the same way."""
+    import trimesh  # imported here: it takes most of a second
+
     vertices, index = np.unique(mesh.vertices, axis=0, return_inverse=True)
     faces = index.reshape(-1)[mesh.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     turns = (faces.argmin(axis=1)[:, None] + np.arange(3)) % 3  # the smallest index first
     first = np.unique(np.take_along_axis(faces, turns, axis=1), axis=0, return_index=True)[1]
-    faces = faces[np.sort(first)]
-    edges = _edges(faces)
-    if len(np.unique(edges, axis=0)) < len(edges):  # two faces have an edge in the same direction
-        import trimesh  # imported here: it takes most of a second
-
-        repaired = trimesh.Trimesh(vertices, faces, process=False)
-        trimesh.repair.fix_winding(repaired)
-        faces = np.asarray(repaired.faces, dtype=np.int64)
-    return Mesh(vertices, faces)
+    repaired = trimesh.Trimesh(vertices, faces[np.sort(first)], process=False)
+    trimesh.repair.fix_winding(repaired)
+    return Mesh(vertices, np.asarray(repaired.faces, dtype=np.int64))
 
 
 def _edges(faces: np.ndarray) -> np.ndarray:
@@ -157,18 +153,14 @@ def _edges(faces: np.ndarray) -> np.ndarray:
 
 def _bodies(mesh: Mesh) -> list[Mesh]:
     """Return the pieces of a mesh whose faces are connected by edges."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    import trimesh
 
     count = len(mesh.faces)
-    edges = np.unique(np.sort(_edges(mesh.faces)), axis=0, return_inverse=True)[1].reshape(-1)
-    links = np.repeat(np.arange(count), 3), count + edges  # of each face with its edges
-    size = count + edges.max() + 1
-    graph = coo_matrix((np.ones(3 * count, dtype=bool), links), shape=(size, size))
-    labels = connected_components(graph, directed=False)[1][:count]
-    ends = np.cumsum(np.unique(labels, return_counts=True)[1])
-    pieces = np.split(mesh.faces[np.argsort(labels, kind="stable")], ends[:-1])
-    return [Mesh(mesh.vertices, faces) for faces in pieces]
+    edges = trimesh.Trimesh(*mesh, process=False).faces_unique_edges
+    # of each face with its edges: more than two faces may have one
+    links = np.column_stack([np.repeat(np.arange(count), 3), count + edges.ravel()])
+    groups = trimesh.graph.connected_components(links, engine="scipy")
+    return [Mesh(mesh.vertices, mesh.faces[group[group < count]]) for group in groups]
 
 
 def _border_loops(mesh: Mesh) -> list[list[int]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import json
 import logging
 import math
 from collections.abc import Iterator, Sequence
@@ -48,6 +49,8 @@ in the close-loop tasks. Cutlery, which `graspable_scale` enlarges to 0.3 m, fit
 MESH_LENGTHS_M = (1e-5, 1e6)
 """Range of lengths before scaling. It admits meshes in units from micrometres to kilometres, which
 `graspable_scale` corrects, and excludes lengths at which the arithmetic fails."""
+MAX_TRIANGLES = 5_000_000
+"""Most triangles of a mesh. A small GLB file can place one mesh a million times."""
 MIN_FLATNESS = 1e-3
 """Least ratio of thickness to length of a solid."""
 
@@ -187,12 +190,32 @@ def _read_with_trimesh(content: bytes, file_type: str) -> Mesh:
     """Return the mesh in a file of one of the formats that trimesh reads, in metres."""
     import trimesh  # imported here: it takes most of a second
 
-    loaded = trimesh.load(
-        io.BytesIO(content), file_type=file_type, process=False, force="mesh", skip_materials=True
+    if file_type == "glb":
+        _check_glb(content)
+    scene = trimesh.load(
+        io.BytesIO(content), file_type=file_type, process=False, force="scene", skip_materials=True
     )
+    placed = [scene.graph[node] for node in scene.graph.nodes_geometry]
+    _check_triangles(sum(len(scene.geometry[name].faces) for _, name in placed))
+    parts = [scene.geometry[name].copy().apply_transform(pose) for pose, name in placed]
+    loaded = trimesh.util.concatenate(parts)
     used, faces = np.unique(np.asarray(loaded.faces), return_inverse=True)
     vertices = np.asarray(loaded.vertices, dtype=np.float64)[used]
     return Mesh(vertices, faces.reshape(-1, 3).astype(np.int64))
+
+
+def _check_glb(content: bytes) -> None:
+    """Check what a GLB file announces, for which trimesh would take memory or look elsewhere."""
+    header = json.loads(content[20:][: int.from_bytes(content[12:16], "little")])
+    for buffer in header.get("buffers", ()):
+        if not buffer.get("uri", "data:").startswith("data:"):
+            raise ValueError(f"its data are in {buffer['uri']!r}; export it as one file")
+    _check_triangles(max((each["count"] for each in header.get("accessors", ())), default=0) // 3)
+
+
+def _check_triangles(count: int) -> None:
+    if count > MAX_TRIANGLES:
+        raise ValueError(f"it has {count} triangles, the most are {MAX_TRIANGLES}; simplify it")
 
 
 def _principal_extents(points: np.ndarray) -> np.ndarray:

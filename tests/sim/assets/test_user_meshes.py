@@ -1,7 +1,9 @@
 """Meshes of users: dialects of their files, any size and position, and surfaces with holes."""
 
+import json
 import logging
 import multiprocessing
+import struct
 import subprocess
 import sys
 
@@ -131,6 +133,52 @@ def test_other_formats_give_the_same_solid_and_truncated_ones_are_refused(tmp_pa
     path.write_bytes(content[: len(content) * 3 // 4])
     with pytest.raises(ConfigError, match="007"):
         graspnet.read_mesh(path)
+
+
+def test_instances_of_a_mesh_are_placed(tmp_path):
+    import trimesh
+
+    scene, mirror = trimesh.Scene(), np.diag([-1.0, 1, 1, 1])
+    for i, pose in enumerate((np.eye(4), mirror)):
+        scene.add_geometry(trimesh.Trimesh(*ell(), process=False), str(i), transform=pose)
+    mesh = graspnet.read_mesh(write(tmp_path, "a.glb", scene.export(file_type="glb")))
+    assert np.ptp(mesh.vertices, axis=0) == pytest.approx([0.12, 0.06, 0.04])
+    assert hulls.volume_and_center(mesh)[0] == pytest.approx(2 * VOLUME_M3, rel=1e-5)
+
+
+def glb(points, **changed):
+    """A GLB file of one triangle for each three points, with some entries of its header changed."""
+    data = np.asarray(points, "<f4").tobytes()
+    place = {"buffer": 0, "byteLength": len(data)}
+    value = {"bufferView": 0, "componentType": 5126, "count": len(points), "type": "VEC3"}
+    mesh = {"primitives": [{"attributes": {"POSITION": 0}}]}
+    header = {"asset": {"version": "2.0"}, "scene": 0, "scenes": [{"nodes": [0]}], "meshes": [mesh]}
+    header |= {"nodes": [{"mesh": 0}], "accessors": [value], "bufferViews": [place]}
+    header |= {"buffers": [{"byteLength": len(data)}], **changed}
+    text = json.dumps(header).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = struct.pack("<I4s", len(text), b"JSON") + text
+    chunks += struct.pack("<I4s", len(data), b"BIN\0") + data
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(chunks)) + chunks
+
+
+HUGE = {"componentType": 5126, "count": 10**12, "type": "VEC3"}
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"accessors": [HUGE]}, "333333333333 triangles, the most are 100"),
+        ({"nodes": [{"mesh": 0}] * 30, "scenes": [{"nodes": [*range(30)]}]}, "120 triangles"),
+        ({"buffers": [{"byteLength": 36, "uri": "../b.bin"}]}, "'../b.bin'; export it as one file"),
+    ],
+)
+def test_a_file_that_announces_more_than_it_has_is_refused(tmp_path, monkeypatch, changed, message):
+    monkeypatch.setattr(graspnet, "MAX_TRIANGLES", 100)
+    points = ball().vertices[[0, 1, 2, 0, 2, 3, 0, 3, 1, 1, 3, 2]]
+    assert len(graspnet.read_mesh(write(tmp_path, "a.glb", glb(points))).faces) == 4
+    with pytest.raises(ConfigError, match=rf"007/a\.glb.*{message}"):
+        graspnet.read_mesh(write(tmp_path, "a.glb", glb(points, **changed)))
 
 
 def test_obj_is_preferred_and_hidden_files_are_skipped(tmp_path):
