@@ -37,14 +37,11 @@ REASONS = {
     "torch._C._functorch.is_functorch_wrapped_tensor": "such a tensor cannot be kept",
     "torch._C._len_torch_dispatch_stack": "modes such as FlopCounterMode see one thread only",
     "torch.autograd.forward_ad._current_level": "NumPy has no forward-mode derivatives",
-    "torch.utils._python_dispatch._disable_current_modes": "constants are real tensors in exports",
 }
 """Of names of torch and TorchRL. An attribute follows its class, a module its package."""
 
 OTHERS = {
-    "_cached_instances": "escnn keeps layers that were made before its signs were fixed",
     "_chunk_key": "zarr 2 has no other way from a chunk's index to its file",
-    "_clebsh_gordan_tensor": "escnn's signs differ between machines",
     "_download": "LeRobot would load from the Hub what a folder lacks",
     "_pull_from_repo": "LeRobot would load from the Hub what a folder lacks",
 }

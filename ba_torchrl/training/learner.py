@@ -27,7 +27,7 @@ def build_to_load(config: ExperimentConfig) -> Learner:
 
 def _build(config: ExperimentConfig, problem: Problem) -> Learner:
     dtype = torch.get_default_dtype()
-    torch.set_default_dtype(torch.float32)  # of the observations; escnn works in no other
+    torch.set_default_dtype(torch.float32)  # of the observations
     try:
         return config.algorithm.build(config.network, problem)
     except ConfigError:
