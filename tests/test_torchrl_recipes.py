@@ -218,3 +218,33 @@ def test_a_collector_of_torchrl_fills_a_replay(name):
         collector.shutdown()
     assert len(replay) == 12
     assert replay.sample()[image].shape == (4, 1, 16, 16)
+
+
+STOCK_SCRIPT = """
+import sys
+import gymnasium
+
+env = gymnasium.make(sys.argv[1], expert=True, seed=0)
+for _ in range(3):
+    _, info = env.reset()
+    is_done = False
+    while not is_done:
+        *_, terminated, truncated, info = env.step(info["expert_action"])
+        is_done = terminated or truncated
+env.close()
+"""
+
+
+def test_a_script_for_gymnasium_is_measured_by_the_success_flag(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(FOLDER.parent)
+    stock_scripts = importlib.import_module("stock_scripts")
+    monkeypatch.setattr(stock_scripts, "WINDOW", 2)
+    monkeypatch.setenv(stock_scripts.LOG, "")  # restored at the end
+    path, log = tmp_path / "script.py", tmp_path / "log.jsonl"
+    path.write_text(STOCK_SCRIPT)
+    name = "BulletArm/CloseLoopBlockReaching-StateDense-v0"
+    monkeypatch.setattr("sys.argv", ["", name, "--log", str(log), "--", str(path), "ENV"])
+    stock_scripts.main()
+    _, _, row = capsys.readouterr().out.splitlines()
+    assert row.split(" | ")[1] == "1.00 of 2"
+    assert len(log.read_text().splitlines()) == 3
