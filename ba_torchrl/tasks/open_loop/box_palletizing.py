@@ -17,7 +17,7 @@ from ba_torchrl.sim.shapes import Box
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, narrowest, outline
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, gaps_m, narrowest, outline
 from ba_torchrl.tasks.manipulation.pick_place_commands import (
     LEVEL_RAD,
     no_op,
@@ -57,8 +57,6 @@ SLOT_RAD = math.pi / 8
 """Largest yaw error of a box in a slot."""
 GRASP_DEPTH_M = 0.008
 """Depth of a grasp below the top of a box, where the fingers fit between its neighbours."""
-SHIFTS = (0.0, 0.3, -0.3, 0.6, -0.6)
-"""Offsets in a slot that are compared, as a multiple of `SLOT_M`."""
 TIP_OVER_M = 0.008
 """Distance beyond the pallet's edge at which an upended box is released, so that it tips over."""
 TIP_SITES = 2
@@ -67,6 +65,8 @@ BLOCKED_M = -5e-3
 """Clearance of a grasp below which it is likely to fail."""
 MAX_SHIFT = 0.6
 """Largest offset at which a box is placed in a slot, as a multiple of `SLOT_M`."""
+SHIFT_STEP = 0.05
+"""Step of the offsets that are compared, as a multiple of `SLOT_M`."""
 RELEASE_MARGIN_M = 1e-3
 """Margin between a finger that opens at a release and the box beside it."""
 FREE_HALF_M = (0.056, 0.016)
@@ -101,6 +101,7 @@ class BoxPalletizing(PackingTask):
     workspace. Paper, appendix A.1.
     """
 
+    expert_version = 1
     scale_limits = (0.75, 1.0)
     max_steps = 40
     num_objects = 18
@@ -307,28 +308,37 @@ class BoxPalletizing(PackingTask):
         return max(FILLING_ORDERS, key=preference)
 
     def _site(self, slot: Rectangle, row: int, neighbors: Sequence[Rectangle]) -> Rectangle:
-        """Return the site in a slot, off its centre if the fingers have no space there otherwise.
+        """Return the site in a slot, as little off its centre as the fingers need.
 
-        The outer boxes of a column are moved apart by what the gap between the slots lacks.
+        The fingers need space to descend. As they open, they push a box that is closer than it
+        should be back to its slot. Grippers with thicker fingers than the gap between slots place
+        the outer boxes of a column apart by what it lacks.
 
         Args:
             row: -1, 0 or 1: the position of the slot along its x axis.
             neighbors: outlines of the other boxes in the layer.
         """
-        needed_m, limit_m = self._finger_gap_m, MAX_SHIFT * SLOT_M * self.unit
-        spread_m = row * min(max(needed_m - (ROW_M - BOX_M[0]) * self.unit, 0.0), limit_m)
-        offsets_m = [spread_m + shift * SLOT_M * self.unit for shift in SHIFTS]
-        sites = [
-            Rectangle(*slot.frame.to_world(min(max(offset_m, -limit_m), limit_m), 0.0), *slot[2:])
-            for offset_m in offsets_m
+        half_m, step_m = self._finger_depth_m / 2, SHIFT_STEP * SLOT_M * self.unit
+        count = round(MAX_SHIFT / SHIFT_STEP)
+        lacking_m = self._finger_depth_m + self._release_m - (ROW_M - BOX_M[0]) * self.unit
+        base = row * min(max(math.ceil(lacking_m / step_m), 0), count)
+        shifts_m = [
+            step_m * n for n in sorted(range(-count, count + 1), key=lambda n: abs(n - base))
         ]
-
-        def space(site: Rectangle) -> int:
-            """Return the gap to the nearest neighbour in millimetres, up to what is needed."""
-            gap = min((gap_m(site, other) for other in neighbors), default=math.inf)
-            return int(min(gap, needed_m) / RELEASE_MARGIN_M)
-
-        return max(sites, key=space)
+        fingers = [
+            Rectangle(
+                *slot.frame.to_world(shift_m + side * (slot.half_x + half_m), 0.0),
+                slot.yaw_rad,
+                half_m,
+                self.robot.gripper.half_width_m,
+            )
+            for shift_m in shifts_m
+            for side in (-1, 1)
+        ]
+        gaps = gaps_m(fingers, neighbors).min(axis=1, initial=math.inf)
+        spaces = np.minimum(gaps.reshape(-1, 2).min(axis=1), 0.0)
+        shift_m = shifts_m[int(spaces.argmax())]
+        return Rectangle(*slot.frame.to_world(shift_m, 0.0), *slot[2:])
 
     def _level_place(self, held: Body, position: Vector, yaw_rad: float) -> PickPlaceCommand | None:
         """Return the place at which a box that is tilted in the gripper is level, if there is one.
@@ -351,12 +361,16 @@ class BoxPalletizing(PackingTask):
         return None
 
     @property
-    def _finger_gap_m(self) -> float:
-        """Gap between boxes side by side in which a finger opens at a release."""
+    def _finger_depth_m(self) -> float:
+        """Space that a finger needs beside a held box, along the closing axis."""
         gripper = self.robot.gripper
-        release_m = PickPlaceLimits().release_opening * gripper.half_gap_m
         depth_m = gripper.finger_reach_below_m(GRASP_DEPTH_M * self.unit, 0.0)
-        return depth_m + release_m + RELEASE_MARGIN_M
+        return depth_m + RELEASE_MARGIN_M
+
+    @property
+    def _release_m(self) -> float:
+        """Distance by which a finger opens at a release."""
+        return PickPlaceLimits().release_opening * self.robot.gripper.half_gap_m
 
     def _tip_over(self, held: Body) -> PickPlaceCommand:
         """Return the place at the pallet's edge from which an upended box tips over."""
