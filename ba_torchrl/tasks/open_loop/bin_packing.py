@@ -17,9 +17,9 @@ from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.footprints import Rectangle, narrowest, outline
+from ba_torchrl.tasks.manipulation.footprints import WIDTH_TOLERANCE_M, Rectangle, outline
 from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, perturbed_pick, pick_command
-from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
+from ba_torchrl.tasks.packing.base import FILLING_ORDERS, RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 
 BIN_M = (0.176, 0.144, 0.08)
@@ -45,20 +45,20 @@ PIXEL_M = 0.001
 """Width of a pixel of the bin's height image."""
 GAP_M = 0.0015
 """Gap around an object in the bin."""
-RING_M = 0.008
-"""Width of the surroundings of a site."""
-TALLER_M = 0.01
-"""Height above a site from which its surroundings enclose it."""
-LEVEL_M = 0.004
-"""Step to which the heights of sites are rounded for that comparison."""
+CELL_M = (0.0827, 0.044)
+"""Distances between the centres of the six cells of a layer, along and across the bin, with even
+gaps around the largest objects, at the appendix's size."""
+LEVEL_M = 0.02
+"""Height of the flattest objects, the step of the levels of cells, at the appendix's size."""
 UNEVEN_COST = 0.5
 """Cost of the height of a site above its mean height."""
-OPEN_COST_M = 0.01
-"""Cost of a site without enclosing surroundings, as a height."""
-NEAR_COST = 0.01
-"""Cost of a site, as a height, per distance towards the objects outside the bin."""
-ACROSS_COST_M = 0.5e-3
-"""Cost of a release with fingers that close across the bin, as a height."""
+
+
+def cells() -> list[tuple[float, float]]:
+    """Return the centres of the cells in the bin's frame, two rows of three, at the appendix's
+    size."""
+    along, across = CELL_M
+    return [(side * along / 2, row * across) for side in (1, -1) for row in (-1, 0, 1)]
 
 
 def object_shapes(unit: float) -> dict[str, Shape]:
@@ -100,6 +100,7 @@ class BinPacking(PackingTask):
     none is held. The episode ends early when an object leaves the workspace. Paper, appendix A.1.
     """
 
+    expert_version = 1
     scale_limits = (0.78, 0.86)
     max_steps = 20
     num_objects = 8
@@ -184,7 +185,8 @@ class BinPacking(PackingTask):
         )
 
     def expert_command(self) -> PickPlaceCommand:
-        """Pick the largest object that can be grasped, and drop it at the best site in the bin."""
+        """Pick the largest object that can be grasped, of equals that nearest to the bin, and drop
+        it in the next cell."""
         held = self.robot.held_body()
         if held is not None:
             return self._drop(held)
@@ -193,16 +195,29 @@ class BinPacking(PackingTask):
             return no_op(self.settings.workspace, is_holding=False)
         grasps = {body: self.grasp(body) for body in outside}
 
-        def order(body: Body) -> tuple[bool, float, float]:
+        def order(body: Body) -> tuple[float, float, float]:
             clearance = grasps[body].clearance_m
-            size = float(np.ptp(body.shape.vertices, axis=0).prod()) if clearance > 0 else 0.0
-            return clearance > 0, round(size, 7), clearance
+            if clearance <= 0:
+                return clearance, 0.0, 0.0
+            size = float(np.ptp(body.shape.vertices, axis=0).prod())
+            distance_m = math.dist(body.position[:2], self.container.position[:2])
+            return math.inf, round(size, 7), -distance_m
 
         body = max(outside, key=order)
         grasp = grasps[body]
         if grasp.clearance_m <= 0:
             return perturbed_pick(self.world, body, grasp.tool, self.action_limits)
         return pick_command(grasp.tool)
+
+    def grasp_sides(self, body: Body) -> list[Rectangle]:
+        """Return the sides between which fingers fit, first those across the bin: no image shows
+        which of the equal sides of a cube or a disc is its first."""
+        across = self.container.yaw_rad + math.pi / 2
+        turns = [
+            (wrap_angle(side.yaw_rad - across, math.pi), side) for side in super().grasp_sides(body)
+        ]
+        turns.sort(key=lambda pair: abs(pair[0]))
+        return [side._replace(yaw_rad=across + turn) for turn, side in turns]
 
     # ----------------------------------------------------------------------------------------
 
@@ -231,50 +246,52 @@ class BinPacking(PackingTask):
         ]
 
     def _drop(self, held: Body) -> PickPlaceCommand:
-        """Return the place that drops an object at the site with the lowest cost.
-
-        Of sites that are equal by the symmetry of the bin, it is the farthest from the objects
-        outside, and fingers close along the bin.
-        """
-        tool_yaw = self.robot.tool_pose()[1]
-        own = narrowest(held, None if self.action_limits.turn_rad else tool_yaw)[0]
-        heights, inside = self._heights(), self._inside()
-        slope = self._slope(held)
-        best: tuple[float, tuple[float, float], float, float] | None = None
-        for quarter in (0, 1):
-            half = (own.half_x, own.half_y) if quarter == 0 else (own.half_y, own.half_x)
-            turn = inside.yaw_rad + quarter * math.pi / 2 - own.yaw_rad
-            if not self.action_limits.turn_rad:
-                if abs(wrap_angle(turn + tool_yaw, math.pi)) > math.pi / 4:
-                    continue  # without yaw only the nearest of the two orientations is possible
-                turn = -tool_yaw
-            found = _best_site(heights, half, slope)
-            if found is None:
-                continue
-            across = ACROSS_COST_M * abs(math.sin(tool_yaw + turn - inside.yaw_rad))
-            if best is None or found[0] + across < best[0]:
-                best = (found[0] + across, *found[1:], turn)
-        if best is None:  # the held object is too large for the bin
-            best = (0.0, (0.0, 0.0), 0.0, 0.0)
-        _, site, top, turn = best
+        """Return the place that drops an object in the next cell, its longer side along the bin."""
+        inside, tool_yaw = self._inside(), self.robot.tool_pose()[1]
+        own = outline(held, tool_yaw)
+        yaw = 0.0
+        if self.action_limits.turn_rad:
+            is_long = own.half_x <= own.half_y + WIDTH_TOLERANCE_M
+            yaw = inside.yaw_rad + (math.pi / 2 if is_long else 0.0)
+        turned = own._replace(yaw_rad=yaw)
+        site, top = self._next_site(turned.extents_m(inside.yaw_rad))
         x, y = inside.frame.to_world(*site)
-        depth = self.depth_m(held)
-        z = max(self._release_m(), top + depth + RELEASE_GAP_M)
+        z = max(self._release_m(), top + self.depth_m(held) + RELEASE_GAP_M)
         # the centre of the outline is placed at the site, not the origin of the object
         ox, oy = held.position[0] - own.x, held.position[1] - own.y
-        at = PlanarFrame(x, y, turn).to_world(ox, oy)
-        command = self.place(held, (*at, held.position[2]), turn)
-        return command._replace(z_m=z)
+        at = PlanarFrame(x, y, yaw - tool_yaw).to_world(ox, oy)
+        return self.place(held, (*at, held.position[2]), yaw - tool_yaw)._replace(z_m=z)
 
-    def _slope(self, held: Body) -> tuple[float, float]:
-        """Return the cost of a site per metre along rows and columns of the height image."""
-        others = [body for body in self.objects if body is not held and not self.is_packed(body)]
-        if not others:
-            return 0.0, 0.0
-        mean = np.mean([body.position[:2] for body in others], axis=0)
-        x, y = self._inside().frame.to_local(*mean)
-        distance_m = max(math.hypot(x, y), 1e-6)
-        return NEAR_COST * x / distance_m, NEAR_COST * y / distance_m
+    def _next_site(self, half_m: tuple[float, float]) -> tuple[tuple[float, float], float]:
+        """Return the site of the next object in the bin's frame, and the height of its support.
+
+        Cells are filled from the corner farthest from the workspace's centre, level by level. The
+        site is as close to the centre of the cell as objects that reach into it allow.
+
+        Args:
+            half_m: half the extents of the object along and across the bin.
+        """
+        sites, tops, costs = _sites(self._heights(), half_m)
+        levels = np.round((costs - FLOOR_M * self.unit) / (LEVEL_M * self.unit))
+        frame, center = self.container_outline().frame, self.settings.workspace.center
+        centers = [(x * self.unit, y * self.unit) for x, y in cells()]
+        found = []
+        for at in centers:
+            offsets = np.abs(sites - at)
+            outside = (offsets > np.array(CELL_M) / 2 * self.unit).any(axis=-1)
+            offset = np.hypot(*np.moveaxis(offsets, -1, 0))
+            # the least level in the cell, and there the least offset
+            found.append(np.lexsort((offset.ravel(), levels.ravel(), outside.ravel()))[0])
+        is_filled = [levels.ravel()[index] > 0 for index in found]
+
+        def preference(order: Sequence[int]) -> tuple[list[bool], float]:
+            filled = [is_filled[number] for number in order]
+            first = centers[order[filled.index(False) if False in filled else 0]]
+            return filled, math.dist(frame.to_world(*first), center)
+
+        order = max(FILLING_ORDERS, key=preference)
+        index = found[min(order, key=lambda number: levels.ravel()[found[number]])]
+        return tuple(sites.reshape(-1, 2)[index].tolist()), float(tops.ravel()[index])
 
     def _heights(self) -> np.ndarray:
         """Return the height image of the bin with its walls, rows along its length."""
@@ -283,46 +300,32 @@ class BinPacking(PackingTask):
         return self._camera.heightmap((inside.x, inside.y), count * PIXEL_M, count, inside.yaw_rad)
 
 
-def _best_site(
-    heights: np.ndarray, half_m: tuple[float, float], slope: tuple[float, float]
-) -> tuple[float, tuple[float, float], float] | None:
-    """Return the site for a box with the lowest cost: low, even and enclosed by its surroundings.
+def _sites(
+    heights: np.ndarray, half_m: tuple[float, float]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return the sites of a box in a height image, their heights, and what these cost.
 
     Args:
         heights: [N, N] height image in metres, with pixels of `PIXEL_M`.
         half_m: half the extents of the box along rows and columns.
-        slope: cost of a site per metre along rows and columns.
 
     Returns:
-        Cost, centre of the site relative to the centre of the image, and height of its highest
-        point; None if the box is larger than the image.
+        Centres [R, C, 2] relative to the centre of the image, heights of their highest points
+        [R, C], and the same with a cost of unevenness, all in metres. A box that is larger than the
+        image has the size of the image.
     """
-    size = [round(2 * (half + GAP_M) / PIXEL_M) for half in half_m]
-    ring = round(RING_M / PIXEL_M)
-    if max(size) > min(heights.shape):
-        return None
+    size = [
+        min(round(2 * (half + GAP_M) / PIXEL_M), count)
+        for half, count in zip(half_m, heights.shape, strict=True)
+    ]
     tops = _window_maxima(_window_maxima(heights, size[0]).T, size[1]).T
     means = _window_sums(heights, size) / (size[0] * size[1])
-    wide = [extent + 2 * ring for extent in size]
-    around = np.pad(heights, ring, mode="edge")
-    taller = np.zeros(tops.shape)
-    levels = np.round(tops / LEVEL_M)
-    for level in set(levels.ravel().tolist()):
-        is_taller = around > level * LEVEL_M + TALLER_M
-        at = levels == level
-        taller[at] = _window_sums(is_taller, wide)[at]
-    enclosed = taller / (wide[0] * wide[1] - size[0] * size[1])
-    costs = tops + UNEVEN_COST * (tops - means) + OPEN_COST_M * (1 - enclosed)
-    along, across = (
-        PIXEL_M * part * np.arange(count) for part, count in zip(slope, costs.shape, strict=True)
-    )
-    costs += along[:, None] + across
-    row, column = np.unravel_index(int(costs.argmin()), costs.shape)
-    center = [
-        (first + extent / 2 - count / 2) * PIXEL_M
-        for first, extent, count in zip((row, column), size, heights.shape, strict=True)
+    centers = [
+        (np.arange(count) + (extent - whole) / 2) * PIXEL_M
+        for count, extent, whole in zip(tops.shape, size, heights.shape, strict=True)
     ]
-    return float(costs[row, column]), tuple(map(float, center)), float(tops[row, column])
+    sites = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1)
+    return sites, tops, tops + UNEVEN_COST * (tops - means)
 
 
 def _window_maxima(values: np.ndarray, size: int) -> np.ndarray:

@@ -163,7 +163,7 @@ class PackingTask(OpenLoopTask):
         half_open = half_gap_m(gripper, self.finger_opening)
         tools = [
             PlanarFrame(*side.frame.to_world(0.0, offset * self.unit), side.yaw_rad)
-            for side in narrowest(body, None if self.action_limits.turn_rad else 0.0)
+            for side in self.grasp_sides(body)
             for offset in self.grasp_offsets_m
             if abs(offset * self.unit) <= max(side.half_y - 0.012, 0.0)
         ]
@@ -175,6 +175,10 @@ class PackingTask(OpenLoopTask):
         best = int(np.minimum(clearances_m, SUFFICIENT_CLEARANCE_M).argmax())
         x, y, yaw = tools[best]
         return TopDownGrasp(body, (x, y, height), yaw, float(clearances_m[best]))
+
+    def grasp_sides(self, body: Body) -> list[Rectangle]:
+        """Return the outlines of an object whose x axes are directions in which fingers close."""
+        return narrowest(body, None if self.action_limits.turn_rad else 0.0)
 
     def place(self, held: Body, position: Vector, turn_rad: float) -> PickPlaceCommand:
         """Return the place of the held body at a position and a yaw up to half turns.
