@@ -48,6 +48,8 @@ GAP_M = 0.0015
 CELL_M = (0.0827, 0.044)
 """Distances between the centres of the six cells of a layer, along and across the bin, with even
 gaps around the largest objects, at the appendix's size."""
+MAX_SHIFT = 0.35
+"""Largest offset of a site from the centre of its cell, as a multiple of `CELL_M`."""
 LEVEL_M = 0.02
 """Height of the flattest objects, the step of the levels of cells, at the appendix's size."""
 UNEVEN_COST = 0.5
@@ -278,7 +280,7 @@ class BinPacking(PackingTask):
         found = []
         for at in centers:
             offsets = np.abs(sites - at)
-            outside = (offsets > np.array(CELL_M) / 2 * self.unit).any(axis=-1)
+            outside = (offsets > MAX_SHIFT * self.unit * np.array(CELL_M)).any(axis=-1)
             offset = np.hypot(*np.moveaxis(offsets, -1, 0))
             # the least level in the cell, and there the least offset
             found.append(np.lexsort((offset.ravel(), levels.ravel(), outside.ravel()))[0])

@@ -1,12 +1,15 @@
 """Bin packing: when an object is packed, release heights, kinds of objects."""
 
+import math
+
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
-from ba_torchrl.sim.geometry import yaw_quaternion
-from ba_torchrl.tasks.manipulation.footprints import Rectangle
-from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, _window_maxima, object_shapes
+from ba_torchrl.sim.geometry import PlanarFrame, yaw_quaternion
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, outline
+from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, _window_maxima, cells, object_shapes
+from ba_torchrl.tasks.packing.base import FILLING_ORDERS
 from tests.tasks.episodes import follow
 from tests.tasks.packing.scenes import BIN, QUARTER_TURN
 
@@ -80,6 +83,34 @@ def test_kinds_are_drawn_with_replacement(make_env):
     assert all(len(kinds) == 8 for kinds in seen)
     assert {kind for kinds in seen for kind in kinds} == set(object_shapes(1.0))
     assert any(kinds.count(kind) >= 3 for kinds in seen for kind in kinds)
+
+
+def test_cells_are_filled_one_after_the_other_with_what_the_image_shows(make_env):
+    env = make_env(BIN)
+    state = env.reset()
+    task = env.scene.task
+    filled = []
+    for _ in range(6):
+        before = state["expert_action"]
+        body = task.grasp(max(task.objects, key=lambda body: not task.is_packed(body))).body
+        *position, yaw = *body.position, body.yaw_rad
+        if body.shape.bounds_m[1][0] == pytest.approx(body.shape.bounds_m[1][1]):
+            body.place(position, yaw + math.pi / 2)  # a cube's sides look the same
+            np.testing.assert_allclose(env.actions.encode(task.expert_command()), before, atol=1e-3)
+            body.place(position, yaw)
+        (state,) = follow(env, state, 1)
+        command, frame = task.expert_command(), task.container_outline().frame
+        held, tool = env.scene.controller.held, task.robot.tool_pose()
+        turn = command.rz_rad - tool[1]
+        own = outline(held, tool[1])
+        off = PlanarFrame(0.0, 0.0, turn).to_world(own.x - tool[0][0], own.y - tool[0][1])
+        site = frame.to_local(command.x_m + off[0], command.y_m + off[1])
+        number, (x, y) = min(enumerate(cells()), key=lambda cell: math.dist(cell[1], site))
+        assert site == pytest.approx((x, y), abs=6e-3)
+        assert math.cos(command.rz_rad - frame.yaw_rad) == pytest.approx(0.0, abs=1e-3)
+        filled.append(number)
+        (state,) = follow(env, state, 1)
+    assert tuple(filled) in FILLING_ORDERS
 
 
 @pytest.mark.parametrize("size", [1, 2, 3, 7, 8, 9, 20])

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from ba_torchrl.core.actions import PLACE
-from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, gap_m, outline
 from ba_torchrl.tasks.open_loop.box_palletizing import BOX_M, PALLET_M, SLOT_M, slots
 from tests.tasks.episodes import follow
 from tests.tasks.packing.scenes import BOXES, QUARTER_TURN
@@ -184,3 +184,23 @@ def test_the_expert_tips_over_a_box_that_stands_on_its_end(make_env):
     seen = follow(env, state)
     assert seen[-1]["success"]
     assert len(seen) <= 12 + 4
+
+
+def test_a_box_is_placed_as_little_off_the_centre_of_its_slot_as_the_fingers_need(make_env):
+    pallet = Pallet(make_env(BOXES, num_objects=6), 4)  # a column, and the first of the other one
+    task, inside = pallet.task, pallet.task.container_outline()
+    x, y, yaw = slots(0)[4]
+    at = pallet.frame.frame.to_world(x, y)
+    slot = Rectangle(*at, inside.yaw_rad + yaw, BOX_M[0] / 2, BOX_M[1] / 2)
+
+    def shift_m():
+        neighbors = [outline(body) for body in task.stacked().values()]
+        site = task._site(slot, 0, neighbors)
+        return math.dist(site[:2], slot[:2])
+
+    for off_m, turn in ((0.0, 0.0), (0.004, 0.0), (0.0, 0.08), (-0.009, 0.3)):
+        pallet.put(3, dy=off_m, turn=turn)
+        pallet.put(1, dx=-0.004, turn=0.05)  # end to end with the slot, where no finger is
+        assert shift_m() == 0.0
+    pallet.put(3, dy=0.009)
+    assert shift_m() == pytest.approx(0.003, abs=6e-4)
