@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,9 +18,9 @@ from ba_torchrl.sim.vision.depth import HeightCamera
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.tasks.body_pool import BodyPool
 from ba_torchrl.tasks.instructions import colored, counted
-from ba_torchrl.tasks.manipulation.footprints import WIDTH_TOLERANCE_M, Rectangle, outline
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, outline
 from ba_torchrl.tasks.manipulation.pick_place_commands import no_op, perturbed_pick, pick_command
-from ba_torchrl.tasks.packing.base import FILLING_ORDERS, RELEASE_GAP_M, PackingTask, open_box
+from ba_torchrl.tasks.packing.base import RELEASE_GAP_M, PackingTask, open_box
 from ba_torchrl.tasks.packing.layout import Footprint, random_rectangle, scatter
 
 BIN_M = (0.176, 0.144, 0.08)
@@ -45,22 +46,20 @@ PIXEL_M = 0.001
 """Width of a pixel of the bin's height image."""
 GAP_M = 0.0015
 """Gap around an object in the bin."""
-CELL_M = (0.0827, 0.044)
-"""Distances between the centres of the six cells of a layer, along and across the bin, with even
-gaps around the largest objects, at the appendix's size."""
-MAX_SHIFT = 0.35
-"""Largest offset of a site from the centre of its cell, as a multiple of `CELL_M`."""
-LEVEL_M = 0.02
-"""Height of the flattest objects, the step of the levels of cells, at the appendix's size."""
+RING_M = 0.008
+"""Width of the surroundings of a site."""
+TALLER_M = 0.01
+"""Height above a site from which its surroundings enclose it."""
+LEVEL_M = 0.004
+"""Step to which the heights of sites are rounded for that comparison."""
 UNEVEN_COST = 0.5
 """Cost of the height of a site above its mean height."""
-
-
-def cells() -> list[tuple[float, float]]:
-    """Return the centres of the cells in the bin's frame, two rows of three, at the appendix's
-    size."""
-    along, across = CELL_M
-    return [(side * along / 2, row * across) for side in (1, -1) for row in (-1, 0, 1)]
+OPEN_COST_M = 0.01
+"""Cost of a site without enclosing surroundings, as a height."""
+TIE_M = 0.0015
+"""Costs within this of the least one are equal."""
+ORDER = (1.0, 0.3)
+"""Weights of the distances along and across the bin in the order of equal sites."""
 
 
 def object_shapes(unit: float) -> dict[str, Shape]:
@@ -188,7 +187,7 @@ class BinPacking(PackingTask):
 
     def expert_command(self) -> PickPlaceCommand:
         """Pick the largest object that can be grasped, of equals that nearest to the bin, and drop
-        it in the next cell."""
+        it in the bin."""
         held = self.robot.held_body()
         if held is not None:
             return self._drop(held)
@@ -248,52 +247,34 @@ class BinPacking(PackingTask):
         ]
 
     def _drop(self, held: Body) -> PickPlaceCommand:
-        """Return the place that drops an object in the next cell, its longer side along the bin."""
+        """Return the place that drops an object at the site with the lowest cost.
+
+        Of equal orientations, it is the one in which fingers close along the bin; of equal sites,
+        the one nearest to the corner farthest from the workspace's centre.
+        """
         inside, tool_yaw = self._inside(), self.robot.tool_pose()[1]
-        own = outline(held, tool_yaw)
-        yaw = 0.0
+        own, heights = outline(held, tool_yaw), self._heights()
+        yaws = [0.0]
         if self.action_limits.turn_rad:
-            is_long = own.half_x <= own.half_y + WIDTH_TOLERANCE_M
-            yaw = inside.yaw_rad + (math.pi / 2 if is_long else 0.0)
-        turned = own._replace(yaw_rad=yaw)
-        site, top = self._next_site(turned.extents_m(inside.yaw_rad))
+            yaws = [inside.yaw_rad, inside.yaw_rad + math.pi / 2]
+        turned = [own._replace(yaw_rad=yaw).extents_m(inside.yaw_rad) for yaw in yaws]
+        found = [_Sites.of(heights, half) for half in turned]
+        least = [sites.costs.min(initial=math.inf) for sites in found]
+        number = next(i for i, cost in enumerate(least) if cost <= min(least) + TIE_M)
+        yaw, sites = yaws[number], found[number]
+        site, top = (0.0, 0.0), 0.0  # of an object that is too large for the bin
+        if sites.costs.size:
+            away = np.sign(inside.frame.to_local(*self.settings.workspace.center)) * -1.0
+            order = sites.centers @ (away * ORDER)
+            order[sites.costs > least[number] + TIE_M] = -math.inf
+            index = np.unravel_index(int(order.argmax()), order.shape)
+            site, top = sites.centers[index].tolist(), float(sites.tops[index])
         x, y = inside.frame.to_world(*site)
         z = max(self._release_m(), top + self.depth_m(held) + RELEASE_GAP_M)
         # the centre of the outline is placed at the site, not the origin of the object
         ox, oy = held.position[0] - own.x, held.position[1] - own.y
         at = PlanarFrame(x, y, yaw - tool_yaw).to_world(ox, oy)
         return self.place(held, (*at, held.position[2]), yaw - tool_yaw)._replace(z_m=z)
-
-    def _next_site(self, half_m: tuple[float, float]) -> tuple[tuple[float, float], float]:
-        """Return the site of the next object in the bin's frame, and the height of its support.
-
-        Cells are filled from the corner farthest from the workspace's centre, level by level. The
-        site is as close to the centre of the cell as objects that reach into it allow.
-
-        Args:
-            half_m: half the extents of the object along and across the bin.
-        """
-        sites, tops, costs = _sites(self._heights(), half_m)
-        levels = np.round((costs - FLOOR_M * self.unit) / (LEVEL_M * self.unit))
-        frame, center = self.container_outline().frame, self.settings.workspace.center
-        centers = [(x * self.unit, y * self.unit) for x, y in cells()]
-        found = []
-        for at in centers:
-            offsets = np.abs(sites - at)
-            outside = (offsets > MAX_SHIFT * self.unit * np.array(CELL_M)).any(axis=-1)
-            offset = np.hypot(*np.moveaxis(offsets, -1, 0))
-            # the least level in the cell, and there the least offset
-            found.append(np.lexsort((offset.ravel(), levels.ravel(), outside.ravel()))[0])
-        is_filled = [levels.ravel()[index] > 0 for index in found]
-
-        def preference(order: Sequence[int]) -> tuple[list[bool], float]:
-            filled = [is_filled[number] for number in order]
-            first = centers[order[filled.index(False) if False in filled else 0]]
-            return filled, math.dist(frame.to_world(*first), center)
-
-        order = max(FILLING_ORDERS, key=preference)
-        index = found[min(order, key=lambda number: levels.ravel()[found[number]])]
-        return tuple(sites.reshape(-1, 2)[index].tolist()), float(tops.ravel()[index])
 
     def _heights(self) -> np.ndarray:
         """Return the height image of the bin with its walls, rows along its length."""
@@ -302,32 +283,45 @@ class BinPacking(PackingTask):
         return self._camera.heightmap((inside.x, inside.y), count * PIXEL_M, count, inside.yaw_rad)
 
 
-def _sites(
-    heights: np.ndarray, half_m: tuple[float, float]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the sites of a box in a height image, their heights, and what these cost.
+class _Sites(NamedTuple):
+    """The sites of a box in a height image, rows along the bin; none if the box is larger."""
 
-    Args:
-        heights: [N, N] height image in metres, with pixels of `PIXEL_M`.
-        half_m: half the extents of the box along rows and columns.
+    centers: np.ndarray
+    """[R, C, 2] relative to the centre of the image."""
+    tops: np.ndarray
+    """[R, C] heights of their highest points."""
+    costs: np.ndarray
+    """[R, C] costs: low, even and enclosed by their surroundings is best. All in metres."""
 
-    Returns:
-        Centres [R, C, 2] relative to the centre of the image, heights of their highest points
-        [R, C], and the same with a cost of unevenness, all in metres. A box that is larger than the
-        image has the size of the image.
-    """
-    size = [
-        min(round(2 * (half + GAP_M) / PIXEL_M), count)
-        for half, count in zip(half_m, heights.shape, strict=True)
-    ]
-    tops = _window_maxima(_window_maxima(heights, size[0]).T, size[1]).T
-    means = _window_sums(heights, size) / (size[0] * size[1])
-    centers = [
-        (np.arange(count) + (extent - whole) / 2) * PIXEL_M
-        for count, extent, whole in zip(tops.shape, size, heights.shape, strict=True)
-    ]
-    sites = np.stack(np.meshgrid(*centers, indexing="ij"), axis=-1)
-    return sites, tops, tops + UNEVEN_COST * (tops - means)
+    @classmethod
+    def of(cls, heights: np.ndarray, half_m: tuple[float, float]) -> _Sites:
+        """Return the sites.
+
+        Args:
+            heights: [N, N] height image in metres, with pixels of `PIXEL_M`.
+            half_m: half the extents of the box along rows and columns.
+        """
+        size = [round(2 * (half + GAP_M) / PIXEL_M) for half in half_m]
+        if max(size) > min(heights.shape):
+            return cls(np.zeros((0, 0, 2)), np.zeros((0, 0)), np.zeros((0, 0)))
+        ring = round(RING_M / PIXEL_M)
+        tops = _window_maxima(_window_maxima(heights, size[0]).T, size[1]).T
+        means = _window_sums(heights, size) / (size[0] * size[1])
+        wide = [extent + 2 * ring for extent in size]
+        around = np.pad(heights, ring, mode="edge")
+        taller = np.zeros(tops.shape)
+        levels = np.round(tops / LEVEL_M)
+        for level in set(levels.ravel().tolist()):
+            is_taller = around > level * LEVEL_M + TALLER_M
+            at = levels == level
+            taller[at] = _window_sums(is_taller, wide)[at]
+        enclosed = taller / (wide[0] * wide[1] - size[0] * size[1])
+        costs = tops + UNEVEN_COST * (tops - means) + OPEN_COST_M * (1 - enclosed)
+        rows, columns = (
+            (np.arange(count) + (extent - whole) / 2) * PIXEL_M
+            for count, extent, whole in zip(tops.shape, size, heights.shape, strict=True)
+        )
+        return cls(np.stack(np.meshgrid(rows, columns, indexing="ij"), axis=-1), tops, costs)
 
 
 def _window_maxima(values: np.ndarray, size: int) -> np.ndarray:
