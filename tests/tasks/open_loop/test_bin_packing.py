@@ -109,7 +109,7 @@ def test_the_expert_decides_by_what_the_image_shows(make_env):
 def test_equal_sites_are_filled_from_the_corner_farthest_from_the_workspaces_centre(make_env):
     env = make_env(BIN)
     for _ in range(2):
-        (state,) = follow(env, env.reset(), 1)
+        follow(env, env.reset(), 1)
         task, frame = env.scene.task, env.scene.task.container_outline().frame
         command = task.expert_command()
         site = frame.to_local(command.x_m, command.y_m)
