@@ -211,14 +211,15 @@ class BinPacking(PackingTask):
         return pick_command(grasp.tool)
 
     def grasp_sides(self, body: Body) -> list[Rectangle]:
-        """Return the sides between which fingers fit, first those across the bin: no image shows
-        which of the equal sides of a cube or a disc is its first."""
-        across = self.container.yaw_rad + math.pi / 2
+        """Return the sides between which fingers fit, first those with the hand along the bin's
+        wall: no image shows which of the equal sides of a cube or a disc is its first."""
+        x, y, _ = (a - b for a, b in zip(body.position, self.container.position, strict=True))
+        along = math.atan2(y, x) + math.pi / 2
         turns = [
-            (wrap_angle(side.yaw_rad - across, math.pi), side) for side in super().grasp_sides(body)
+            (wrap_angle(side.yaw_rad - along, math.pi), side) for side in super().grasp_sides(body)
         ]
         turns.sort(key=lambda pair: abs(pair[0]))
-        return [side._replace(yaw_rad=across + turn) for turn, side in turns]
+        return [side._replace(yaw_rad=along + turn) for turn, side in turns]
 
     # ----------------------------------------------------------------------------------------
 
