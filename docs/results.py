@@ -180,7 +180,8 @@ def _all_tasks(board: Leaderboard) -> Iterator[str]:
     yield "![Success of all tasks](results/tasks.svg)\n"
     yield f"{LEGEND}\n"
     if board.left_out:
-        yield from ("Left out:", "", *(f"- {run}" for run in board.left_out), "")
+        runs = [f"- {run}".replace(f"{ROOT}/", "") for run in board.left_out]
+        yield from ("Left out:", "", *runs, "")
     for heading, tasks in tasks_by_heading(board.tasks).items():
         yield f"### {heading}\n"
         yield from pipes(HEADER, *(row for task in tasks for row in _rows(board, task)))
