@@ -101,7 +101,6 @@ def noise():
 
 
 POLICIES = {
-    "CNN": "close_loop/corner_picking",
     "Equi": PICKING,
     "ASR": "ramp/block_stacking",
     "Equi ASR": STACKING,
@@ -209,7 +208,6 @@ SLOW += [
     "learner, rlpd equi",
     "learner, bc equi",
     "learner, spatial_q equi_deictic_asr",
-    "policy, CNN",
     "policy, ASR",
     "policy, Equi ASR",
 ]
