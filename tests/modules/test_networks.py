@@ -179,5 +179,5 @@ def test_parameters_that_are_reset_have_the_sizes_of_a_new_network(name):
         if wanted.numel() < 200 or not wanted.any():
             assert value.abs().max() <= 4 * wanted.abs().max(), key
         else:
-            assert float(value.std()) == pytest.approx(float(wanted.std()), rel=0.3), key
+            assert value.std().item() == pytest.approx(wanted.std().item(), rel=0.3), key
             assert not torch.equal(value, wanted), key

@@ -18,7 +18,6 @@ from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.checkpoint import lock_run
 from ba_torchrl.training.grid import jobs
 from ba_torchrl.training.grid.jobs import run_all
-from ba_torchrl.training.grid.launchers import local
 from ba_torchrl.training.grid.plan import Status, status
 from tests.recipes import recipe
 from tests.record.test_report import RESULT, policy_test, write
@@ -331,7 +330,7 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
 
     assert "1 of 1 runs done" in printed("seeds=1")
     breaking = [sys.executable, "-c", "raise SystemExit('it broke')"]
-    monkeypatch.setattr(local, "run_all", functools.partial(run_all, worker=breaking))
+    monkeypatch.setattr(jobs, "run_all", functools.partial(run_all, worker=breaking))
     with pytest.raises(SystemExit) as end:
         printed("seeds=2")
     assert end.value.code == 1
@@ -352,7 +351,7 @@ def test_the_recipe_runs_a_grid_in_processes_and_lists_it(tmp_path, capsys, monk
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(local, "run_all", interrupted)
+    monkeypatch.setattr(jobs, "run_all", interrupted)
     with pytest.raises(SystemExit):
         printed("seeds=2")
     assert "the same command continues the grid\n" in capsys.readouterr().err
