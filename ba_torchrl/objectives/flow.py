@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from typing import Protocol
 
 import torch
@@ -83,10 +83,6 @@ class FlowMatchingLoss(ImitationLoss):
         self.draws = draws
         self._set_observation(actor_network.in_keys[:-1])
 
-    def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
-        """Recompute `in_keys`; the loss has no value estimator."""
-        self.in_keys = [*self._observation, self.tensor_keys.action, self.tensor_keys.is_valid]
-
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_flow``.
@@ -95,10 +91,10 @@ class FlowMatchingLoss(ImitationLoss):
             tensordict: observations [...], chunks [..., T, A], and which of their actions count
                 [..., T].
         """
-        self._set_batch_size(tensordict, tensordict[self.tensor_keys.action].ndim - 2)
+        chunk, is_valid = (tensordict[key] for key in astuple(self.tensor_keys))
+        self._set_batch_size(tensordict, chunk.ndim - 2)
         flow: ChunkNetwork = self.network("actor_network").module
         observation = [tensordict[key] for key in self._observation]
-        chunk, is_valid = (tensordict[key] for key in self.in_keys[len(observation) :])
         noise = torch.randn(self.draws, *chunk.shape, dtype=chunk.dtype, device=chunk.device)
         time = torch.rand(noise.shape[:-2], dtype=chunk.dtype, device=chunk.device)
         noisy = torch.lerp(noise, chunk.expand_as(noise), time[..., None, None])

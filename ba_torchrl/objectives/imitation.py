@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import torch
 import torch.nn.functional as F
@@ -49,7 +49,7 @@ class ImitationLoss(EvalModeTargetsLoss):
 
     def _forward_value_estimator_keys(self, **_: NestedKey) -> None:
         """Recompute `in_keys`; the loss has no value estimator."""
-        self.in_keys = [*self._observation, self.tensor_keys.action]
+        self.in_keys = [*self._observation, *astuple(self.tensor_keys)]
 
 
 class BehaviourCloningLoss(ImitationLoss):

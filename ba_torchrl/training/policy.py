@@ -107,7 +107,9 @@ class TrainedPolicy(TensorDictModuleBase):
     ) -> None:
         super().__init__()
         self.policy = learner.policy.requires_grad_(False)
-        self.in_keys, self.out_keys = list(learner.policy.in_keys), [keys.ACTION]
+        self.in_keys, self.out_keys = (
+            list(names) for names in (learner.policy.in_keys, learner.policy.out_keys)
+        )
         images = {key: image.shape for key, image in learner.images.items()}
         vectors = {key: (length,) for key, length in learner.vectors.items()}
         known = {**images, **vectors, keys.HOLDING: (1,)}
@@ -176,7 +178,8 @@ class TrainedPolicy(TensorDictModuleBase):
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Write ``action``; the observation may be on another device than the policy.
+        """Write ``action``, and what the policy carries to the next step; the observation may be on
+        another device than the policy.
 
         Raises:
             ConfigError: the observation lacks an entry that the policy reads, or its shape is
@@ -187,9 +190,10 @@ class TrainedPolicy(TensorDictModuleBase):
         self._check_observed(self.in_keys, observed)
         device = next(self.parameters()).device
         with set_exploration_type(ExplorationType.DETERMINISTIC), constant_weights():
-            found = self.policy(tensordict.select(*self.in_keys).to(device))[keys.ACTION]
-        action = found.to(tensordict.device or found.device, torch.float32)
-        return tensordict.set(keys.ACTION, action)
+            seen = tensordict.select(*self.in_keys, keys.CARRIED, strict=False).to(device)
+            found = self.policy(seen).select(*self.out_keys)
+        found[keys.ACTION] = found[keys.ACTION].float()
+        return tensordict.update(found.to(tensordict.device or device))
 
     def _check_observed(
         self, wanted: Iterable[NestedKey], observed: Mapping[NestedKey, torch.Size]

@@ -1,10 +1,13 @@
 """Entries that a policy carries to the next step, in everything that plays episodes."""
 
+from pathlib import Path
+from types import SimpleNamespace
 from typing import ClassVar
 
 import pytest
 import torch
 from tensordict.nn import TensorDictModuleBase
+from torch import nn
 from torchrl.collectors import Collector
 from torchrl.envs import SerialEnv
 
@@ -13,8 +16,10 @@ from ba_torchrl.algorithms.acting import ActingPolicy
 from ba_torchrl.core import keys
 from ba_torchrl.demonstrations.episodes import collect_episodes
 from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training import protocol
 from ba_torchrl.training.evaluation import acting_on, record_episodes
+from ba_torchrl.training.policy import TrainedPolicy
 
 TASK = "close_loop/block_reaching"
 SMALL = {"obs_size": 16, "seed": 0, "max_steps": 5}
@@ -29,6 +34,7 @@ class Counting(TensorDictModuleBase):
     def __init__(self):
         super().__init__()
         self.in_keys, self.out_keys = [keys.STEP_COUNT], [keys.ACTION, COUNT]
+        self.unused = nn.Parameter(torch.zeros(()))  # its device is the policy's
 
     def forward(self, tensordict):
         first = tensordict[keys.STEP_COUNT] == 0
@@ -60,6 +66,16 @@ def test_collected_episodes_keep_them(policy):
     env = ba_torchrl.make_vector_env(TASK, 2, parallel=False, **SMALL)
     episodes = collect_episodes(env, acting_on(policy, torch.device("cpu")), 4)
     assert [episode[COUNT].flatten().tolist() for episode in episodes] == [list(range(5))] * 4
+    env.close()
+
+
+def test_a_trained_policy_passes_them_on(policy):
+    resolved = resolve_env(TASK, SMALL)
+    learner = SimpleNamespace(policy=ActingPolicy(policy, []), images={}, vectors={})
+    config = SimpleNamespace(task=TASK, resolved_env=resolved)
+    trained = TrainedPolicy(learner, config, 0, Path("runs"), versions_of(TASK))
+    env = ba_torchrl.make(resolved)
+    assert env.rollout(5, trained)[COUNT].flatten().tolist() == list(range(5))
     env.close()
 
 

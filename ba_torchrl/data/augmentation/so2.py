@@ -79,9 +79,10 @@ def rotate_displacement(displacement: Tensor, angle_rad: Tensor) -> Tensor:
         angle_rad: [B] float64 on the CPU, radians.
     """
     _, *rotation = quarters_and_rotation(angle_rad)
-    cos, sin = (to_device(x.to(displacement.dtype), displacement.device) for x in rotation)
-    if displacement.ndim == 3:
-        cos, sin = cos[:, None], sin[:, None]
+    of_rows = (-1, *[1] * (displacement.ndim - 2))
+    cos, sin = (
+        to_device(x.to(displacement.dtype), displacement.device).view(of_rows) for x in rotation
+    )
     dx, dy = displacement.unbind(dim=-1)
     turned = torch.stack([cos * dx - sin * dy, sin * dx + cos * dy], dim=-1)
     return turned / turned.abs().amax(dim=-1, keepdim=True).clamp_min(1)
@@ -243,10 +244,9 @@ class SO2Augmentation(SeededTransform):
                 continue
             action = tensordict[key].clone()
             rows = to_device(chosen, action.device)
-            turned = action[rows]
-            plane = turned[..., self._plane]
-            turned[..., self._plane] = rotate_displacement(plane, angle)
-            action[rows] = turned
+            plane = to_device(torch.tensor(self._plane, device="cpu"), action.device)
+            turned = rotate_displacement(action[rows].index_select(-1, plane), angle)
+            action[rows] = action[rows].index_copy(-1, plane, turned)
             out.set(key, action)
         return out
 
