@@ -76,28 +76,6 @@ def test_the_expert_descends_while_it_moves_and_turns_near_the_object_only(make)
     assert abs(near.dyaw_rad) > 0.3
 
 
-def test_a_low_hand_closes_or_rises(make):
-    """It neither turns beside the object nor opens fingers that have begun to close."""
-    env = make(num_objects=1, object_set="household")
-    scene, task = env.scene, env.scene.task
-    brick = next(body for body in task.pool.bodies if body.name == "brick")
-    task.pool.deactivate(task.objects[0])
-    task.pool.activate(brick)
-    brick.place((0.45, 0.0, FLOOR_Z_M + 0.02), 0.0)
-    scene.world.settle()
-    yaw = task._plan(scene.robot.tool_pose(), task.planner.heights()).yaw_rad
-    for aside_m, opening in ((0.0, 1.0), (0.0, 0.45), (0.03, 1.0)):
-        scene.controller.reset(((0.45 + aside_m, 0.0, 0.035), yaw + 0.1), opening)
-        command = task.expert_command()
-        if aside_m:
-            assert command.opening == 1.0
-            assert command.dz_m > 0.02
-            assert command[1:3] == (0.0, 0.0)
-            assert command.dyaw_rad == 0.0
-        else:
-            assert command.opening == 0.0
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("config", "least"),
