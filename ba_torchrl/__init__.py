@@ -29,7 +29,7 @@ _MODULES = {
     "make_vector_env": "envs.factory",
     "resolve_env": "envs.settings",
 }
-"""Modules of the public names, imported at their first use: that of TorchRL takes seconds."""
+"""Modules of the public names, imported at their first use: TorchRL takes seconds."""
 
 __all__ = [
     "BulletArmEnv",

@@ -199,7 +199,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
 
     @_OfClass
     def available_envs(cls) -> list[str]:
-        """Ids of all tasks, those of plugins included."""
+        """Ids of all tasks, plugins' included."""
         return list(TASKS)
 
     @property
@@ -252,7 +252,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         They have no effect on the simulation. The first call follows `reset`, the others each step.
 
         Args:
-            at_contact: the call is that of `on_contact`.
+            at_contact: `on_contact` makes the call.
         """
         yield self.render(width, height)
 
@@ -329,7 +329,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         state = tensordict[keys.STATE]
         if not isinstance(state, EnvState):
             raise ConfigError(
-                f"the entry {keys.STATE!r} is not that of get_state() of one environment, but "
+                f"the entry {keys.STATE!r} is not from get_state() of one environment, but "
                 f"{type(state).__name__}; for several, reset(set_state=True, "
                 'list_of_kwargs=[{"state": each} for each in states])'
             )

@@ -23,7 +23,7 @@ _HEADINGS = {
     "bump": _SIX_DOF,
 }
 """Heading of each group of tasks, the part of their ids before the slash. The heading of a group
-that is not listed, such as that of a plugin, is its name."""
+that is not listed, such as a plugin's, is its name."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class TaskDescription:
     instruction: str
     """The goal of an episode as a sentence, an example."""
     conditions: tuple[str, ...]
-    """Names of the conditions, all of which a success fulfils."""
+    """Names of the conditions; a success fulfils all of them."""
     randomised: tuple[str, ...]
     """What differs from episode to episode."""
     observations: dict[str, tuple[int, ...]]
@@ -165,7 +165,7 @@ def summary(task: str) -> str:
 
 
 def tasks_by_heading(tasks: Iterable[str]) -> dict[str, list[str]]:
-    """Return the tasks of each heading: those of the package first, then others as they occur."""
+    """Return the tasks of each heading: the package's first, then others as they occur."""
     found: dict[str, list[str]] = {heading: [] for heading in _HEADINGS.values()}
     for task in tasks:
         group = task.split("/")[0]

@@ -3,7 +3,7 @@
 A fault is an error of PyBullet or of its connection, a pose or an observation that is not finite,
 or a body that passed through the floor or was thrown away. In a step, it ends the episode
 truncated, and the next reset builds a new world. In a reset, the episode starts again in a new
-world. Any other error is one of the code, such as that of a task, and is raised. Faults of many
+world. Any other error comes from the code, such as a task's, and is raised. Faults of many
 episodes in a row are taken for an error of the code as well.
 """
 

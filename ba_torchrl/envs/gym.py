@@ -153,7 +153,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         if keys.INSTRUCTION in state:
             values[keys.INSTRUCTION] = self.instruction
         # TorchRL's readers of infos need a `dtype`, which Python's bools lack; vectors of Gymnasium
-        # stack arrays and Python's bools, not those of NumPy
+        # stack arrays and Python's bools, not NumPy's
         arrays = {key: np.asarray(value) for key, value in values.items()}
         info = {key: a if a.dtype == bool else a[()] for key, a in arrays.items()}
         if keys.EXPERT_ACTION in state:

@@ -34,7 +34,7 @@ WRIST_RANGE_M = (0.02, 2.0)
 _REACH_M = 2.0
 """No arm's gripper is farther from its base."""
 _FAR = 100.0
-"""Larger than any position that is scaled by the workspace, those of removed objects included."""
+"""Larger than any position that is scaled by the workspace, even a removed object's."""
 _MAX_TILT_RAD = math.pi / 8
 """More than the tilt of a gripper between two actions, which point it down; in open loop it is
 tilted during actions only."""

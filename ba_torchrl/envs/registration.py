@@ -31,7 +31,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 def gym_id(task: str, variant: str = "") -> str:
     """Return Gymnasium's id of a registered task, which ends in its version.
 
-    The id of ``close_loop/block_picking`` is ``BulletArm/CloseLoopBlockPicking-v0``, and that of
+    The id of ``close_loop/block_picking`` is ``BulletArm/CloseLoopBlockPicking-v0``; the id of
     ``mine/push_far``, a task from outside the package, is ``BulletArm/MinePushFar-v0``.
 
     Args:

@@ -159,7 +159,7 @@ def check_env(
 ) -> tuple[EnvConfig, dict[str, Any]]:
     """Validate the parameters of an environment as far as this needs no torch.
 
-    Arguments and errors are those of `resolve_env`.
+    Arguments and errors are as in `resolve_env`.
 
     Returns:
         The parameters, and the values from which they follow.

@@ -1,4 +1,4 @@
-"""Hyper-parameters of networks, each of which is built for images and actions."""
+"""Hyper-parameters of networks, which are built for images and actions."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from ba_torchrl.core.registry import Registry
 class NetworkConfig(StrictModel):
     """A registered network: its hyper-parameters, and how it is built.
 
-    Its module imports no torch: those of this package name in `builder` what builds the network.
+    Its module imports no torch: this package's classes name in `builder` what builds the network.
     Another one can override `build` instead.
     """
 

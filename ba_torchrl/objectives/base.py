@@ -43,7 +43,7 @@ class TransitionLoss(EvalModeTargetsLoss):
 
     @dataclass
     class _AcceptedKeys:
-        """Entries that ``set_keys`` can rename; those of the next state are nested in "next"."""
+        """Entries that ``set_keys`` can rename; entries of the next state are nested in "next"."""
 
         action: NestedKey = keys.ACTION
         reward: NestedKey = keys.REWARD
@@ -159,7 +159,7 @@ class TransitionLoss(EvalModeTargetsLoss):
             weights: importance weights [...] from `_importance_weights`.
             chosen: bool [...]; the other samples have no loss and are left out of the mean, which
                 is zero if there are none.
-            reduction: None for that of the module.
+            reduction: None for the module's own.
         """
         reduction, counted = reduction or self.reduction, None
         if weights is not None and self.weight_norm == "max":

@@ -15,7 +15,7 @@ from ba_torchrl.objectives.networks import EvalModeTargetsLoss
 class EvalModeTargetsIQLLoss(IQLLoss, EvalModeTargetsLoss):
     """TorchRL's ``IQLLoss``, whose networks are in training mode only in the terms that train them.
 
-    Arguments and values are those of `torchrl.objectives.IQLLoss`.
+    Arguments and values are as in `torchrl.objectives.IQLLoss`.
     """
 
     qvalue_network_in_evaluation_mode: TensorDictModule

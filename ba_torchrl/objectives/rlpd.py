@@ -17,7 +17,7 @@ class RLPDLoss(SACfDLoss):
     """`SACfDLoss` with K critics.
 
     With a random subset M of the target critics, drawn in each call for the whole batch, two terms
-    differ from those of `SACfDLoss`::
+    differ from `SACfDLoss`::
 
         y_i        = r_i + gamma (1 - terminated_i) (min_{k in M} q'_k(s'_i, a') - h_i)
         loss_actor = mean_i (alpha log pi(a | s_i) - mean_k q_k(s_i, a))

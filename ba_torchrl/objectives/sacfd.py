@@ -316,11 +316,11 @@ class SACfDLoss(TransitionLoss):
     def contrastive_loss(self, tensordict: TensorDictBase) -> TensorDict:
         """Return ``loss_contrastive``, the contrastive loss of the encoder.
 
-        The encoder's features are anchors, and those of the target encoder, of another view of the
+        The encoder's features are anchors. The target encoder's features, of another view of the
         same observations, are positives (CURL: Srinivas et al., 2020; FERM: Zhan et al., 2020).
 
         Args:
-            tensordict: observations [B], of which only the first of several views is used, and
+            tensordict: observations [B]; only the first of several views is used, and
                 other views of them under "positive".
 
         Raises:
@@ -385,13 +385,13 @@ class SACfDLoss(TransitionLoss):
         return seen
 
     def _for_views(self, values: Tensor) -> Tensor:
-        """Return values [..., B, D] of samples as those of their views [..., B, views, D]."""
+        """Return values [..., B, D] of samples as values of their views [..., B, views, D]."""
         if self.views == 1:
             return values
         return values.unsqueeze(-2).expand(*values.shape[:-1], self.views, values.shape[-1])
 
     def _over_views(self, losses: Tensor) -> Tensor:
-        """Return the losses of samples [..., B], means over those of their views."""
+        """Return the losses of samples [..., B], means over their views' losses."""
         return losses.mean(dim=-1) if self.views > 1 else losses
 
     def _demonstration_error(self, tensordict: TensorDictBase, sample: Tensor) -> Tensor:

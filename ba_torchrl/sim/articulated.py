@@ -14,7 +14,7 @@ from ba_torchrl.sim.meshes import Mesh
 from ba_torchrl.sim.shapes import Shape, Solid
 
 LINK_MARGIN_M = 1e-3
-"""PyBullet's collision margin of a hull; that of a link, other than the base, cannot be changed."""
+"""PyBullet's collision margin of a hull; a link's, except the base's, cannot be changed."""
 
 
 @dataclass(frozen=True, kw_only=True)

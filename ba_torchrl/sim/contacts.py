@@ -1,6 +1,6 @@
 """Contacts and distances between bodies, read from PyBullet.
 
-Contact points are those of the last physics step or collision detection. Distances are computed
+Contact points come from the last physics step or collision detection. Distances are computed
 for the current poses.
 """
 
@@ -25,7 +25,7 @@ CANCELLED = 0.1
 class Contact(NamedTuple):
     """A contact point, or a pair of closest points, of two bodies.
 
-    The fields are those of PyBullet's contact points, in the same order.
+    The fields are PyBullet's, in the same order.
     """
 
     flag: int

@@ -139,7 +139,7 @@ def gable_mesh(size_m: tuple[float, float, float], eaves_m: float = 0.0) -> Mesh
 def rod_mesh(length_m: float, diameter_m: float, sides: int = 16) -> Mesh:
     """Return a cylinder along y, centred at the origin, with a regular polygon as cross-section.
 
-    ``diameter_m`` is that of the polygon's circumscribed circle.
+    ``diameter_m`` belongs to the polygon's circumscribed circle.
     """
     angles = 2 * np.pi * np.arange(sides) / sides
     ring = np.stack([np.sin(angles), np.zeros(sides), np.cos(angles)], axis=1) * diameter_m / 2

@@ -78,7 +78,7 @@ SIMULATOR_ERRORS = (pybullet.error, SimulationError)
 class Physics:
     """Settings of the physics engine.
 
-    The defaults are those of close-loop control. With a finger force of 2 and bounded
+    The defaults are for close-loop control. With a finger force of 2 and bounded
     accelerations, grasps at 120 Hz with 50 solver iterations are as stable as at 240 Hz.
     """
 
@@ -116,7 +116,7 @@ class World:
     worlds.
 
     Args:
-        window: show the simulation in PyBullet's window, of which a process can have one.
+        window: show the simulation in PyBullet's window; a process can have one.
         floor_color: red, green, blue, alpha of the floor; None keeps PyBullet's blue chequered
             texture.
 

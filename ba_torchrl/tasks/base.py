@@ -34,7 +34,7 @@ GREEN: Color = (0.35, 0.7, 0.35, 1.0)
 ORANGE: Color = (0.9, 0.55, 0.15, 1.0)
 
 PAIR_ATTEMPTS = 2000
-"""Random layouts before a `PlacementError`. The least likely one, that of two pulling blocks with
+"""Random layouts before a `PlacementError`. The least likely one, two pulling blocks with
 fixed orientations, is found in 1 of 30 attempts."""
 
 BELOW_FLOOR_M = -0.05
@@ -173,7 +173,7 @@ class Task(ABC):
     def instruction(self) -> str:
         """Return the goal of the present episode as an English sentence: "pick up the red block".
 
-        It begins with a verb in lower case and has no full stop. Colours and numbers are those of
+        It begins with a verb in lower case and has no full stop. Colours and numbers describe
         the objects.
         """
 
@@ -184,7 +184,7 @@ class Task(ABC):
 
     @property
     def landmarks(self) -> Sequence[YawPose]:
-        """The poses in the vector observation; by default those of the objects."""
+        """The poses in the vector observation; by default the objects'."""
         return [(body.position, body.yaw_rad) for body in self.objects]
 
     def conditions(self) -> dict[str, bool]:
@@ -302,7 +302,7 @@ class OpenLoopTask(Task):
     """A task whose actions are picks and places (appendix A.1, G.1).
 
     Without a z component in the action, `pick_height_m` and `place_height_m` return the height of
-    the tool from ``top_m``, that of the highest point in a window around the target.
+    the tool from ``top_m``, the highest point in a window around the target.
     """
 
     control = "open_loop"

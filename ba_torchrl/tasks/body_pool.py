@@ -1,4 +1,4 @@
-"""A pool of bodies that are loaded once, of which every episode uses some."""
+"""A pool of bodies that are loaded once; every episode uses some of them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ COLUMNS = 10
 
 
 class BodyPool:
-    """Bodies of which only some are in the scene at a time.
+    """Bodies, only some of which are in the scene at a time.
 
     Inactive bodies are hidden and at a great height, in Bullet's sleeping state, in which they are
     not simulated. Their masses and collision filters are as before: a change would change the order

@@ -22,7 +22,7 @@ COLOR_NAMES: dict[str, tuple[float, float, float]] = {
 }
 """Red, green and blue of the named colours."""
 GRAY_SHARE = 0.1
-"""Share of the largest component by which those of black, gray and white differ at most."""
+"""Largest spread of the components of black, gray and white, as a share of the largest."""
 GRAY_RANGE = (0.2, 0.9)
 """Largest components of gray; black is darker, white is lighter."""
 NUMBERS = (

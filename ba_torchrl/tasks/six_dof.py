@@ -86,16 +86,16 @@ VARIANTS: tuple[tuple[str, type[OpenLoopTask], dict[str, Any]], ...] = (
         {"platform_m": (0.24, 0.2), "scale_limits": (0.75, 0.85)},
     ),
 )
-"""Id, the same task on level ground, and further attributes that differ from those of it."""
+"""Id, the same task on level ground, and further attributes in which the two differ."""
 
 
 def task_on(task_id: str, level: type[OpenLoopTask], attributes: dict[str, Any]) -> type:
-    """Return the task of a variant; its name is that on level ground after that of the terrain."""
+    """Return the task of a variant; its name is the terrain's and the level task's."""
     terrain, _, name = task_id.partition("/")
     attributes = {**TERRAINS[terrain], **attributes}
     size_cm = (f"{100 * size:g}" for size in attributes.get("platform_m", ()))
     description = f"""{name.replace("_", " ").title()} {DESCRIPTIONS[terrain].format(*size_cm)}
-    Objects and goal are those of `open_loop/{name}`. The episode ends early when a piece that must
+    Objects and goal are as in `open_loop/{name}`. The episode ends early when a piece that must
     stay upright lies on its side, or a piece leaves the workspace. Paper, appendix C.
     """
     own = {"__module__": __name__, "__doc__": description}

@@ -77,7 +77,7 @@ class Spacing(NamedTuple):
     padding_m: float
     """Twice the least distance between its centre and the border."""
     distance_m: float
-    """Least distance between its centre and those of the objects placed before it."""
+    """Least distance between its centre and the centres of objects placed before it."""
 
 
 @dataclass(frozen=True)

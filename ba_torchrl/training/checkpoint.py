@@ -106,7 +106,7 @@ def check_same_run(
 ) -> None:
     """Check that the run in the folder of ``config`` has the same settings, task and expert.
 
-    The device may differ, and that of the folder need not exist on this machine.
+    The device may differ, and the folder's device need not exist on this machine.
 
     Args:
         config: of the run.
@@ -447,7 +447,7 @@ def resumable_updates(folder: str | Path) -> int | None:
 
 
 class _Generators(GlobalRNGState):
-    """The process's generators; those of a GPU are restored only where there are as many GPUs."""
+    """The process's generators; a GPU's generator is restored only where there are as many GPUs."""
 
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> None:
         here = self.state_dict()

@@ -42,9 +42,9 @@ SET_BY_THE_EXPERIMENT = ("seed", "expert")
 
 
 class ExperimentConfig(WorkerOptions):
-    """One training run. The defaults are those of the close-loop benchmarks (appendix G.2).
+    """One training run, by default as in the close-loop benchmarks (appendix G.2).
 
-    Where the appendix gives no value, the default is that of the reference implementation, and the
+    Where the appendix gives no value, the default is from the reference implementation, and the
     field says so. `parse` checks all fields, nested ones included, before anything starts.
     """
 
@@ -70,8 +70,8 @@ class ExperimentConfig(WorkerOptions):
     choice, which is convolutions only."""
     compile_mode: CompileMode | None = None
     """Mode of `torch.compile` for the loss and its gradient; None does not compile them. Needs a
-    compiler of the system, and minutes at the first update; random draws differ from those of a
-    run that is not compiled."""
+    compiler of the system, and minutes at the first update; random draws differ from a
+    run's that is not compiled."""
     num_envs: int = Field(default=5, ge=1, le=1024)
     """Number of environments that step together."""
     parallel: bool | None = None
@@ -117,7 +117,7 @@ class ExperimentConfig(WorkerOptions):
     min_replay: int = Field(default=100, ge=1)
     """Transitions in the replay before the first update; reference implementation."""
     eval_every: int = Field(default=500, ge=1)
-    """Updates between evaluations of the greedy policy, the first of which is of the untrained one;
+    """Updates between evaluations of the greedy policy. The first evaluates the untrained policy;
     a checkpoint follows each later one, and the best and the latest ones are kept."""
     eval_episodes: int = Field(default=100, ge=1)
     """Episodes of each of these evaluations; reference implementation."""
@@ -130,7 +130,7 @@ class ExperimentConfig(WorkerOptions):
     save_minutes: float = Field(default=10.0, gt=0)
     """Minutes after which the state for ``resume`` is saved, besides at every evaluation."""
     log_every: int = Field(default=50, ge=1)
-    """Updates between rows of the losses; a shorter run has one row, that of its last update."""
+    """Updates between rows of the losses; a shorter run has one row, for its last update."""
     logger: Backend = "csv"
     """Logger of scalars in addition to the run folder's CSV file."""
     video_episodes: int = Field(default=3, ge=0)
@@ -323,7 +323,7 @@ _REGISTRIES = {"network": NETWORKS, "algorithm": ALGORITHMS, "collector": COLLEC
 
 
 def _without_replaced(values: Mapping[str, Any], given: Collection[str]) -> dict[str, Any]:
-    """Return values without those of parts that given ones replace."""
+    """Return values without the parts that given values replace."""
     out = dict(values)
     for kind, registry in _REGISTRIES.items():
         below = [name.removeprefix(f"{kind}.") for name in given if name.startswith(f"{kind}.")]

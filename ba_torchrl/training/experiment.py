@@ -92,7 +92,7 @@ class Experiment:
         self._signals = StopSignals()
         self._can_save = False
         """Whether there is a state that can be saved: no update is under way, and the networks are
-        those of the last one."""
+        as the last update left them."""
         self._last_save = time.perf_counter()
         self._bar = progress_bar(total=config.total_updates, disable=not progress, unit="update")
 

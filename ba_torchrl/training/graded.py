@@ -1,6 +1,6 @@
 """Graded sets of episodes for offline learning: random, expert, medium and mixed.
 
-The grades are those of D4RL (Fu et al., 2020): uniformly random actions; the expert; a policy whose
+The grades are as in D4RL (Fu et al., 2020): uniformly random actions; the expert; a policy whose
 training ended at about half success; and equal parts of these three.
 """
 
@@ -96,7 +96,7 @@ class GradedSets:
         return self.folder / grade
 
     def seed_of(self, grade: Grade) -> int:
-        """Return the seed of the first episodes of a set; "mixed" begins with those of random."""
+        """Return the seed of the first episodes of a set; "mixed" begins as "random"."""
         part = 1 + GRADES.index("random" if grade == "mixed" else grade)
         return derive_seed(self.seed, SeedUse.DEMONSTRATIONS, part)
 

@@ -198,7 +198,7 @@ class TrainedPolicy(TensorDictModuleBase):
     def _check_observed(
         self, wanted: Iterable[NestedKey], observed: Mapping[NestedKey, torch.Size]
     ) -> None:
-        """Check that entries are observed, with shapes that end in those of training."""
+        """Check that entries are observed, with shapes that end in the shapes of training."""
         if missing := [key for key in wanted if key not in observed]:
             raise ConfigError(
                 f"the policy of {self.task} reads {', '.join(map(str, missing))}, which is not "
@@ -413,5 +413,5 @@ def evaluate_command(source: str | Path, result: RunResult) -> str:
 
 
 def shipped_policies() -> list[str]:
-    """Return the tasks of which the package ships a policy."""
+    """Return the tasks for which the package ships a policy."""
     return [task for task in TASKS if shipped_file(task).exists()]

@@ -105,7 +105,7 @@ def register() -> None:
 
 def method_name(algorithm: str, replay: str, rotation: str) -> str:
     """Return the name of a method, such as "sacfd_per_so2": its presets joined by "_", without
-    those of uniform replay and of no rotation."""
+    the presets of uniform replay and no rotation."""
     defaults = ("", "uniform", "none")
     chosen = zip((algorithm, replay, rotation), defaults, strict=True)
     return "_".join(name for name, default in chosen if name != default)

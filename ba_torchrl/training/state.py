@@ -48,7 +48,7 @@ class RunState:
 
     @contextmanager
     def timed(self, phase: Phase) -> Iterator[None]:
-        """Context whose time is that of a phase; the time between such contexts is "other"."""
+        """Context whose time counts for a phase; the time between such contexts is "other"."""
         self.add_time("other")
         try:
             yield

@@ -22,7 +22,7 @@ class Vector(ChecksPolicy, EnvBase):
     """Environments that step together, with batch size [num_workers].
 
     Actions are validated before any environment moves. Attributes and methods that this class does
-    not have are those of the environments: ``vector.horizon`` is a list of their values, and
+    not have belong to the environments: ``vector.horizon`` is a list of their values, and
     ``vector.render()`` a list of results.
 
     Args:

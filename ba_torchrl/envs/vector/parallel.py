@@ -230,7 +230,7 @@ class VectorEnv(Vector):
 
         Args:
             commands: by index of the worker.
-            timeout_s: seconds to wait; by default that of the options.
+            timeout_s: seconds to wait; by default as in the options.
 
         Returns:
             The answers, and the errors of the workers that failed, which are killed; by index.

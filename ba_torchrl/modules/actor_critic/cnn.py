@@ -23,7 +23,7 @@ class PlainActor(XavierInitialised):
     """Gaussian policy: an image trunk, and one network each for mean and log-std.
 
     Args:
-        head: from its features to those of the policy.
+        head: from the encoder's features to the policy's.
         loc: from these to the mean, before the squashing.
         log_std: from these to the log standard deviation.
     """

@@ -1,4 +1,4 @@
-"""Critics beside those of the networks: ensembles (Ball et al., 2023; "RLPD"), values of states."""
+"""Critics beside the networks' own: ensembles (Ball et al., 2023; "RLPD"), values of states."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class BatchedLinear(nn.Module):
 class FieldNorm(nn.Module):
     """Layer normalisation per head, over fields and their components.
 
-    Scale and shift are those of a field, so that a permutation of each field's components by a
+    Each field has one scale and one shift, so that a permutation of each field's components by a
     group element commutes with the normalisation.
     """
 

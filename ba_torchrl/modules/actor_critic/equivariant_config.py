@@ -15,11 +15,11 @@ class EquivariantConfig(ImageNetworkConfig):
     """Hyper-parameters of the equivariant actor-critic.
 
     Args:
-        group_order: number of rotations n of the group, at least 2; the default is that of the
+        group_order: number of rotations n of the group, at least 2; the default is from the
             reference implementation.
         reflections: the group is the dihedral group D_n, with n at least 3, instead of the cyclic
             group C_n.
-        n_hidden: number of regular fields of the last layers; the default is that of the reference
+        n_hidden: number of regular fields of the last layers; the default is from the reference
             implementation. The first layer has an eighth of it
             at 128 px, and a quarter at 64 px, where the first stage is left out.
     """
@@ -40,7 +40,7 @@ class StridedEquivariantConfig(EquivariantConfig):
     Not part of the paper. A 4x4 kernel with stride 2 reads pixels that are symmetric about the
     centre of the image, so that quarter turns remain exact; a 3x3 kernel with stride 2 does not. It
     takes four products per input pixel and pair of channels where a 3x3 kernel before a max pool
-    takes nine. The stages, their numbers of fields and the arguments are those of
+    takes nine. The stages, their numbers of fields and the arguments are as in
     `EquivariantConfig`.
     """
 

@@ -24,7 +24,7 @@ class ImageNetworkConfig(NetworkConfig):
 
     With the floor as the reference, the floor's depth is an input of its own, the same at all
     pixels, and the image becomes heights above it, so that the activations of the floor do not
-    exceed those of the objects on it.
+    exceed the objects' activations.
 
     Args:
         precision: number format of the convolutions, see `compute_dtype`.

@@ -19,7 +19,7 @@ SUPPORTED_IMAGE_SIZES = (64, 128)
 def trunk_stages(image_size: int, widths: Iterable[int]) -> list[tuple[int, int, bool]]:
     """Return (width, padding, pools) of each stage of a trunk that ends at one pixel.
 
-    The padding is that of a 3x3 convolution before a 2x2 pool; in place of both, a 4x4 convolution
+    The padding is as for a 3x3 convolution before a 2x2 pool; in place of both, a 4x4 convolution
     with stride 2 gives the same size. 128 px shrink to 8 in four pooled stages; then come 8 -> 8,
     8 -> 6 with a pool to 3, and 3 -> 1. At 64 px the first stage is left out (design, section 2).
 

@@ -15,7 +15,7 @@ class ASRNetworkConfig(SpatialImageConfig):
     """Hyper-parameters of every ASR network.
 
     Args:
-        num_rotations: yaws, evenly spaced; the default is that of the reference implementation.
+        num_rotations: yaws, evenly spaced; the default is from the reference implementation.
         patch_size: rows and columns of the patch around a pixel that the later levels see; None for
             the size of the in-hand image (in the paper 24, and 40 on bumps). If the two sizes
             differ, the in-hand image is cropped or zero-padded to the patch size about its centre.

@@ -78,7 +78,7 @@ class SpatialQNetwork(nn.Module, ABC):
     """Q values of an action that is chosen level by level, each given the choices before it.
 
     The primitive is not chosen: an empty gripper picks, a gripper that holds an object places. The
-    values are those of that primitive.
+    values belong to this primitive.
     """
 
     levels: tuple[Level, ...]
@@ -142,10 +142,10 @@ def _computed(config: SpatialImageConfig, images: Tensor) -> Tensor:
 
 
 def select_primitive(values: Tensor, holding: Tensor) -> Tensor:
-    """Return the values of the primitive: those of picks where nothing is held, else of places.
+    """Return values of the primitive: of picks where nothing is held, else of places.
 
     Args:
-        values: [B, 2n, ...], first those of picks, then those of places.
+        values: [B, 2n, ...], first for picks, then for places.
         holding: [B, 1].
 
     Returns:

@@ -167,7 +167,7 @@ class EquivariantYawValues(XavierInitialised):
 def pixels_and_yaws(
     config: EquiASRConfig, spec: SpatialSpec, yaw_config: EquiASRConfig, patch_size: int
 ) -> tuple[EquivariantPixelValues, tuple[HeightView, EquivariantYawValues]]:
-    """Return the values of the pixels, and those of the yaws with their view."""
+    """Return the values of the pixels, and the yaws' values with their view."""
     group = planar_rotations(config.group_order, has_flips=True)
     positions = EquivariantPixelValues(group.trivial_repr, spec, config)
     yaw_repr = planar_yaws(config.num_rotations, spec.half_rotation)

@@ -19,7 +19,7 @@ class EquiASRConfig(ASRNetworkConfig):
 
     Args:
         group_order: number of rotations of the dihedral group of the pixel values; the default is
-            that of the reference implementation.
+            from the reference implementation.
         scene_head: how the later levels read the scene feature map: "pool" keeps them equivariant
             or invariant under rotations of the scene; "flatten", of the reference implementation,
             keeps the positions of the features, so only the patch's part of the yaw values is

@@ -85,7 +85,7 @@ class _Head(nn.Module):
 
 
 class EquivariantPixelValues(nn.Module):
-    """Q values of every pixel, equivariant; those of places also depend on the in-hand image.
+    """Q values of every pixel, equivariant; values of places also depend on the in-hand image.
 
     Args:
         out_repr: how the values of one pixel transform: the trivial representation for a single

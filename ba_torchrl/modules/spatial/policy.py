@@ -222,7 +222,7 @@ class SpatialValues(nn.Module):
 class SpatialPolicy(nn.Module):
     """Epsilon-greedy policy on spatial Q values.
 
-    A random action has random angles and a random pixel among those of objects, if there are any.
+    A random action has random angles and a random pixel of an object, if there is one.
     TorchRL's ``EGreedyModule`` would also draw the primitive, which the state determines. As in
     TorchRL, the policy explores under the exploration type RANDOM only.
 

@@ -10,7 +10,7 @@ from ba_torchrl.core.config import StrictModel
 
 
 class PoseGridConfig(StrictModel):
-    """Hyper-parameters of the levels of z and the tilts; the defaults are those of the
+    """Hyper-parameters of the levels of z and the tilts; the defaults are from the
     reference implementation; the appendix gives none.
 
     Args:

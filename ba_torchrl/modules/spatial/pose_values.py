@@ -102,7 +102,7 @@ class PoseValues(XavierInitialised):
         self.reset_parameters()
 
     def forward(self, views: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
-        """Return values [B, K * values_per_view], those of the first view first.
+        """Return values [B, K * values_per_view], the first view's first.
 
         Args:
             views: heights or projections [B, K, C, p, p].
@@ -123,7 +123,7 @@ class PoseValues(XavierInitialised):
         first, *others = self.convs
         hand = centre_fit(scaled_in_hand(self.config, in_hand), views.shape[-1])
         of_view, of_hand = first.weight.split([views.shape[2], hand.shape[1]], dim=1)
-        # The sum of both convolutions is that of the concatenated channels.
+        # Both convolutions add up to one of the concatenated channels.
         x = _convolve(scaled_in_hand(self.config, views.flatten(0, 1)), of_view, first.bias)
         x.unflatten(0, views.shape[:2]).add_(_convolve(hand, of_hand)[:, None])
         for conv in others:
@@ -148,7 +148,7 @@ class FingerSymmetricValues(nn.Module):
 
     def forward(self, views: Tensor, in_hand: Tensor, scene: Tensor, holding: Tensor) -> Tensor:
         """Return values [B, K * values_per_view] of views [B, 2 K, C, p, p], see
-        `BothFingerOrders`; the other arguments are those of `PoseValues`."""
+        `BothFingerOrders`; the other arguments are as in `PoseValues`."""
         views = torch.cat(views.chunk(2, dim=1))
         in_hand = torch.cat([in_hand, self.in_hand.reverse_axes(in_hand, "xy")])
         values = self.values(views, in_hand, scene, holding.repeat(2, 1))

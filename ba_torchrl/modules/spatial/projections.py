@@ -1,6 +1,6 @@
 """Projections of the voxels below a heightmap in the frames of many tool poses, in one batch.
 
-The numbers are those of the in-hand mode "proj" (`ba_torchrl.sim.vision.in_hand`), for all poses of
+The numbers equal the in-hand mode "proj" (`ba_torchrl.sim.vision.in_hand`), for all poses of
 a deictic encoding at once and on any device. A device without float64 computes in float32; there,
 voxels close to halfway between two cells can belong to the other one.
 """
@@ -134,10 +134,10 @@ def project(patches: Tensor, pixel_m: float, z_m: Tensor, cells: Tensor) -> Tens
 
 
 def project_upright(patches: Tensor, pixel_m: float, z_m: Tensor, rz_rad: Tensor) -> Tensor:
-    """Return the projections of tools without tilts, with yaws [B], which equal those of `project`.
+    """Return the projections of tools without tilts, with yaws [B], as `project` does.
 
     The occupied voxels of a column are then those below a height, before and after the rotation and
-    the median filter, so no voxels are needed. The other arguments and the result are those of
+    the median filter, so no voxels are needed. Other arguments and the result are as in
     `project`.
     """
     size = patches.shape[-1]

@@ -15,7 +15,7 @@ class RotFCNConfig(SpatialImageConfig):
     """Hyper-parameters of the Rot FCN.
 
     Args:
-        num_rotations: yaws, evenly spaced; the default is that of the reference implementation.
+        num_rotations: yaws, evenly spaced; the default is from the reference implementation.
     """
 
     builder: ClassVar[str] = "ba_torchrl.modules.spatial.rot_fcn:build_rot_fcn"

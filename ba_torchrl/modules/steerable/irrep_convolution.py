@@ -5,7 +5,7 @@ the basis of irreps, a 3x3 filter of C_8 therefore needs 84 products per pixel a
 instead of 576, one of D_4 72 of 576, and one of C_4 36 of 144. The convolution has three steps:
 fixed linear maps of each field's neighbourhood (change of basis, harmonics on the rings of the
 filter, sums of those that transform equally), matrix products with the weights, and the change of
-basis back. The result equals that of the expanded filter up to rounding. It is computed for groups
+basis back. The result equals the expanded filter's up to rounding. It is computed for groups
 of images, or of rows of an image, whose maps fit the second cache.
 """
 
@@ -181,7 +181,7 @@ class IrrepKernels:
         gather_maps(fields, self.change, *self.of_maps, padding, top, maps.flatten(0, 1).numpy())
 
     def scatter(self, maps: Tensor, padding: int, top: int, fields: np.ndarray) -> None:
-        """Add the gradient of fields [n, F, N, H, W], from that of maps [M, F, pixels]."""
+        """Add the gradient of fields [n, F, N, H, W], from the maps' gradient [M, F, pixels]."""
         scatter_maps(maps.flatten(0, 1).numpy(), self.change, *self.of_values, padding, top, fields)
 
     def weights(self, coefficients: Tensor) -> list[Tensor]:

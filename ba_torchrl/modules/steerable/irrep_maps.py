@@ -206,7 +206,7 @@ def scatter_maps(
     top: int,
     fields: np.ndarray,
 ) -> None:
-    """Add the gradient of fields [n, F, N, H, W], from that of their maps [M * F, pixels].
+    """Add the gradient of fields [n, F, N, H, W], from the maps' gradient [M * F, pixels].
 
     ``starts``, ``terms`` and ``factors`` list the maps of each value.
     """

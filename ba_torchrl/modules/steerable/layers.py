@@ -243,7 +243,7 @@ class DynamicSteerableConv2d(nn.Module):
     Another network computes them from invariants, such as the in-hand image, which has the
     gripper's frame and does not rotate with the scene.
 
-    The coefficients are those of the kernels, ordered by output field, input field and kernel,
+    The coefficients belong to the kernels, ordered by output field, input field and kernel,
     followed by one bias for each trivial irrep of the output. The module has no parameters.
 
     Args:

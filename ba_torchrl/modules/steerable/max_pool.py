@@ -33,7 +33,7 @@ _compiled = njit(nogil=True, error_model="numpy")
 def relu_of_max_pool(x: Tensor, negative_slope: float = 0.0) -> Tensor:
     """Return the ReLU of the 2x2 max pool of x [B, C, H, W], as [B, C, H // 2, W // 2].
 
-    The values are those of PyTorch's functions, gradient included. In float32 on the CPU it stores
+    Values and gradients equal PyTorch's. In float32 on the CPU it stores
     one byte for the position of each maximum instead of eight, is several times faster, and has no
     second derivative.
 
@@ -137,7 +137,7 @@ def _pool_channels_last(slope: float, x: np.ndarray, y: np.ndarray, positions: n
 
 @_compiled
 def _where(position: int, place: int, value: int) -> int:
-    """Return the bits of a float32 if it belongs to a position, otherwise those of zero."""
+    """Return the bits of a float32 if it belongs to a position, otherwise the bits of zero."""
     return value & np.uint32(-np.int32(position == place))  # faster than a choice of floats
 
 

@@ -160,7 +160,7 @@ class PlanarGroup:
     def harmonic(self, frequency: int) -> tuple[list[IrrepId], np.ndarray]:
         """Return the irreps of the circular harmonics of a frequency, and the change of basis.
 
-        Its columns are the irreps' bases in that of (cosine, sine).
+        Its columns are the irreps' bases, written in (cosine, sine).
         """
         if frequency == 0:
             return [(0, 0) if self.has_flips else (0,)], np.eye(1)

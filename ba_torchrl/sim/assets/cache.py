@@ -73,7 +73,7 @@ def cached_parts(content: bytes, recipe: str, make: Callable[[], Decomposition])
 
 
 _unusable: set[str] = set()
-"""Folders of which a warning has been given."""
+"""Folders for which a warning was given."""
 
 
 def _warn_once(folder: str, problem: str) -> None:

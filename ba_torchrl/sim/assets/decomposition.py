@@ -21,13 +21,13 @@ from ba_torchrl.sim.meshes import Mesh, merge_meshes, polygon_triangles, read_ob
 logger = logging.getLogger(__name__)
 
 CONVEX_FILL = 0.95
-"""Least ratio of the volume of a convex mesh to that of its convex hull."""
+"""Least volume of a convex mesh as a share of its convex hull's."""
 SOLID_FILL = 0.8
-"""Least ratio of the volume of the parts to that of the mesh; thin shells have much less."""
+"""Least volume of the parts as a share of the mesh's; thin shells have much less."""
 THICK_FILL = 1.5
-"""Greatest ratio of the volume of the parts to that of the mesh without a note."""
+"""Greatest volume of the parts, in the mesh's, without a note."""
 SHEET_FILL = 0.05
-"""Greatest ratio of the volume of a mesh to that of its parts if the mesh consists of sheets."""
+"""Greatest volume of a mesh that consists of sheets, as a share of its parts' volume."""
 EXTENT_TOLERANCE = 0.05
 """Greatest difference between the bounding boxes of parts and mesh, in lengths of the mesh."""
 VHACD = {"resolution": 100_000, "depth": 20, "concavity": 0.0025, "maxNumVerticesPerCH": 48}

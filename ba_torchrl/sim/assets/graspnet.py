@@ -1,4 +1,4 @@
-"""Meshes in a folder of the user, such as those of GraspNet-1Billion (appendix, figure 16)."""
+"""Meshes in a folder of the user, such as GraspNet-1Billion's (appendix, figure 16)."""
 
 from __future__ import annotations
 
@@ -221,7 +221,7 @@ def _check_triangles(count: int) -> None:
 def _principal_extents(points: np.ndarray) -> np.ndarray:
     """Return the extents [3] of points [N, 3] along their principal axes, in ascending order.
 
-    Unlike those of the bounding box, they do not depend on the orientation of the mesh.
+    Unlike a bounding box's, these extents do not depend on the orientation of the mesh.
     """
     unit = np.abs(points).max() or 1.0  # avoids underflow and overflow of the squares
     centred = points / unit - np.mean(points / unit, axis=0)

@@ -5,7 +5,7 @@ The number of physics steps of a motion is bounded. There are three cases:
 - Nothing is held, and the path is free: the arm is teleported along the free part of the path,
   which is checked at samples (with `fast_mode`; otherwise this part is simulated, too).
 - Nothing is held, and something is near: the rest of the path is simulated at a bounded speed. The
-  deceleration is below that of the floor's friction, so that a pushed body stays at the finger.
+  deceleration is less than the floor's friction causes, so that a pushed body stays at the finger.
 - A body is held: the path is simulated with quintic time scaling, whose acceleration the friction
   of the grasp can transmit. With `fast_mode`, a body that did not slip in such a motion, and that
   nothing but the gripper supported at its end, is teleported with the arm along the free part of
@@ -395,7 +395,7 @@ def stop_swing(robot: Robot, max_steps: int) -> bool:
 def is_swinging(robot: Robot) -> bool:
     """Whether the fingers are too fast, or past the closed or open position without a contact.
 
-    A contact can hold them there: that of a wide body, or of the rod of a drawer's handle.
+    A contact can hold them there, with a wide body or the rod of a drawer's handle.
     """
     opening, rate = robot.finger_motion()
     if abs(rate) * robot.finger_open_position > MAX_OVERSPEED * robot.finger_speed:

@@ -1,4 +1,4 @@
-"""Open-loop pick and place, of which only the parts with contacts are simulated.
+"""Open-loop pick and place, in which only the parts with contacts are simulated.
 
 The arm is teleported to the approach if it is free, the fingers are teleported to the smallest
 opening without contact, and a held body is teleported with the hand. Grasping, lifting, lowering
@@ -51,7 +51,7 @@ class SupportSurface(Protocol):
     ) -> float:
         """Return the least height of the tool at which the fingers close above the surface.
 
-        A rotation of None points down; ``opening`` is that of the fingers before they close.
+        A rotation of None points down; ``opening`` is the fingers' before they close.
         """
 
 
@@ -435,7 +435,7 @@ class PickPlace:
     def _is_clear(self) -> bool:
         """Whether hand and held body are clear of all other bodies at their current poses.
 
-        This computes closest points instead of contact points: those of bodies that penetrate each
+        This computes closest points, not contact points: contacts of bodies that penetrate each
         other affect later steps through caches of the engine that no saved state contains.
         """
         client, robot = self.world.client, self.robot

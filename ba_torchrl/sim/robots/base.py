@@ -74,7 +74,7 @@ class Robot(ABC):
     finger_links: ClassVar[tuple[frozenset[int], frozenset[int]]]
     """PyBullet indices of the links of the left and of the right finger."""
     finger_gear_ratio: ClassVar[float] = -1.0
-    """The velocity of the left finger joint is minus this times that of the right one. Without such
+    """Minus the ratio of the left finger joint's velocity to the right one's. Without such
     a gear, two fingers with limited force do not resist motion of a held body along the closing
     axis."""
     grasp_normal_signs: ClassVar[tuple[float, float]]
@@ -357,7 +357,7 @@ ROBOTS: Registry[type[Robot]] = Registry("robot", "ba_torchrl.sim.robots", Robot
 
 
 def add_gear(client: int, robot: int, joints: tuple[int, int], ratio: float) -> None:
-    """Couple two joints: the velocity of the first is minus ``ratio`` times that of the second."""
+    """Couple two joints: the first has minus ``ratio`` times the second's velocity."""
     axes = (0, 1, 0), (0, 0, 0), (0, 0, 0)
     gear = pybullet.createConstraint(
         robot, joints[0], robot, joints[1], pybullet.JOINT_GEAR, *axes, physicsClientId=client

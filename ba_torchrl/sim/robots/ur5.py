@@ -71,7 +71,7 @@ class UR5(Robot):
         q5 = -math.acos(cos5)
         sin5 = math.sqrt(1 - cos5 * cos5)
         if sin5 < 1e-6:
-            return None  # wrist singularity: the last axis is parallel to those of joints 2 to 4
+            return None  # wrist singularity: the last axis is parallel to the axes of joints 2 to 4
         across = tuple((a - cos5 * s) / sin5 for a, s in zip(approach, side, strict=True))
         wrist_2 = cross(across, side)  # axis of joint 5
         total = math.atan2(across[2], -dot(across, front))  # sum of joints 2, 3 and 4

@@ -18,7 +18,7 @@ Values = Literal["depth", "height", "color"]
 class Camera:
     """Where a camera is, and which point of the world each of its pixels shows.
 
-    The axes are those of OpenCV: x follows the image's columns, y its rows, z the view. The centre
+    The axes are OpenCV's: x follows the image's columns, y its rows, z the view. The centre
     of the pixel in row i and column j has the image coordinates u = j and v = i.
 
     Attributes:
@@ -45,7 +45,7 @@ class Camera:
     def points(self, image: np.ndarray) -> np.ndarray:
         """Return the point of the world in each pixel, [H, W, 3] float64 metres.
 
-        Pixels with clipped values, and those of drawn fingers in close loop, show no surface.
+        Pixels with clipped values, and pixels of drawn fingers in close loop, show no surface.
 
         Args:
             image: of this camera, or of another one with its pose: [H, W] or [1, H, W], metres.
@@ -55,7 +55,7 @@ class Camera:
         """
         values = np.asarray(image, dtype=np.float64)
         if self.values == "color":
-            raise ConfigError("a camera of colours has no depths; use that of 'rgb_depth'")
+            raise ConfigError("a camera of colours has no depths; use the camera of 'rgb_depth'")
         shape = (self.pixels, self.pixels)
         if values.shape not in (shape, (1, *shape)):
             raise ConfigError(f"the image must be {[*shape]} or {[1, *shape]}, not {values.shape}")

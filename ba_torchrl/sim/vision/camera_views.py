@@ -210,7 +210,7 @@ class TopDown(View):
         return self.to_values(scene, heights, center, turn, camera_z)
 
     def camera(self, scene: ViewInput) -> Camera:
-        """Return the geometry; depths below the tool are those of a camera at its height."""
+        """Return the geometry; depths below the tool are as from a camera at its height."""
         setup, ((x, y, z), yaw) = scene.setup, scene.tool
         return orthographic(
             (

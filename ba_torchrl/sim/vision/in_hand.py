@@ -1,7 +1,7 @@
 """In-hand images of the held object, cropped from the heightmap before the pick.
 
 Images are in the tool frame: rows run along the closing axis of the fingers, and the tool point is
-at the centre. The size of a pixel equals that of the heightmap.
+at the centre. A pixel is as large as the heightmap's.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class PickView(NamedTuple):
     z_m: float
     """Height of the tool point."""
     rz_rad: float
-    """Rotation of the tool about z; the angles are those of `tool_rotation`."""
+    """Rotation of the tool about z; the angles are as in `tool_rotation`."""
     ry_rad: float = 0.0
     rx_rad: float = 0.0
 

@@ -86,7 +86,7 @@ def paint_square(
 ) -> None:
     """Set the pixels whose centres lie in a rotated square.
 
-    The centre of the square has a row and a column; that of pixel (i, j) is (i+1/2, j+1/2). The
+    The square's centre has a row and a column; pixel (i, j) has its centre at (i+1/2, j+1/2). The
     rotation is from rows towards columns.
     """
     half_diagonal = half_px * math.sqrt(2)
@@ -229,7 +229,7 @@ def splat(points, count, x0, y0, pixel, image):
     """Set a height image to the greatest height of the first ``count`` points in each pixel.
 
     Pixels without points take the value of the nearest pixel with points. Without any points, the
-    image is unchanged. The geometry of the image is that of `rasterize_heights`.
+    image is unchanged. The geometry of the image is as in `rasterize_heights`.
     """
     rows, cols = image.shape
     heights = np.full((rows, cols), -np.inf)

@@ -99,7 +99,7 @@ def render_rgb(
 ) -> np.ndarray:
     """Render the scene with the robot and shadows on the floor, [height, width, 3] uint8.
 
-    The components of the floor's colour are from 0 to 1; None keeps that of PyBullet.
+    The components of the floor's colour are from 0 to 1; None keeps PyBullet's.
     """
     view = viewpoint.view_matrix()
     projection = pybullet.computeProjectionMatrixFOV(FOV_DEG, width / height, 0.05, 10.0)

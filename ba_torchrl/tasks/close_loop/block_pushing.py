@@ -23,7 +23,7 @@ class BlockPushing(CloseLoopTask):
     """Objects: a cubic block of 5 cm and a square goal area of 9 cm, which images show as a recess
     of 2 cm.
 
-    Goal: the centre of the block is within 5 cm of that of the goal area. The episode ends early
+    Goal: the block's centre is within 5 cm of the goal area's centre. The episode ends early
     when the block leaves the workspace. Paper, appendix A.2.
     """
 

@@ -320,7 +320,7 @@ class CornerPicking(CloseLoopTask):
     def _drag(self) -> GripperCommand:
         """Press on the block and drag it away from both walls, straight towards its target.
 
-        The lower the fingertips, the longer the displacement, up to that of fingers on the block.
+        The lower the fingertips, the longer the displacement, until the fingers are on the block.
         """
         goal = self.corner.to_world(
             *(max(b, DRAG_GOAL_M) for b in self.corner.to_local(*self.block.position[:2]))

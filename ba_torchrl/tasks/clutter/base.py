@@ -39,7 +39,7 @@ class ClutterTask(Task):
     """A task of grasping an object from a heap, in which the next episode continues with the rest.
 
     New objects are dropped when the tray is empty, when an object has left the workspace, and after
-    ``max_attempts`` episodes with the same heap, of which an episode that is reset early is one. In
+    ``max_attempts`` episodes with the same heap; an episode that is reset early counts. In
     the appendix, a heap with remaining objects is never replaced; the reference implementation
     replaces it in these cases, and its number of attempts is the default.
     """

@@ -138,7 +138,7 @@ class PushPlanner:
     ) -> Iterator[Push]:
         """Yield a pull of a body near a wall, by its top, towards the centre of the tray.
 
-        The friction of the fingers exceeds that of the floor, and the walls have none.
+        The fingers have more friction than the floor, and the walls have none.
         """
         tray_center = np.array(self._grasps.workspace.center)
         points = self._grasps.placed_samples(body)

@@ -110,7 +110,7 @@ def outline(body: Body, yaw_rad: float | None = None) -> Rectangle:
     """Return the bounding rectangle of a body's footprint.
 
     Args:
-        yaw_rad: yaw of the rectangle; that of the body if None.
+        yaw_rad: yaw of the rectangle; the body's yaw if None.
     """
     yaw = body.yaw_rad if yaw_rad is None else yaw_rad
     (rectangle,) = _bounding_rectangles(world_vertices(body), [yaw])

@@ -1,6 +1,6 @@
 """Clearance of the whole hand, also of a tilted one, and of fingers from outlines of bodies.
 
-The terms are those of `ba_torchrl.tasks.manipulation.clearance`.
+`ba_torchrl.tasks.manipulation.clearance` explains the terms.
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ def turn_m(robot: Robot, yaws_rad: Iterable[float]) -> float:
     """Return the least yaw error of the gripper in metres, see `TURN_M`.
 
     Args:
-        yaws_rad: yaws of the gripper, of which one suffices; half a turn makes no difference.
+        yaws_rad: yaws of the gripper; one suffices, and half a turn makes no difference.
     """
     yaw = robot.tool_pose()[1]
     return TURN_M * min(abs(wrap_angle(wanted - yaw, math.pi)) for wanted in yaws_rad)

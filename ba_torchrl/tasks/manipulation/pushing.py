@@ -32,7 +32,7 @@ from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 PUSH_HEIGHT_M = 0.02
 """Height of the tool above the lower bound of the workspace during a push."""
 PUSH_HEIGHT_TOLERANCE_M = 0.015
-"""Largest height above that of a tool that pushes."""
+"""Largest height above a pushing tool's."""
 PUSH_OFFSET_M = 0.015
 """Largest distance from the line of a tool that pushes."""
 PUSH_YAW_RAD = 0.4

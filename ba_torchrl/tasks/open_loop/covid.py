@@ -410,7 +410,7 @@ class CovidTest(OpenLoopTask):
         return pick_command(grasp)
 
     def _pick_candidates(self) -> list[Body]:
-        """Return the bodies of which one is picked next."""
+        """Return the bodies, one of which is picked next."""
         uncollected = self._uncollected()
         if uncollected:
             return uncollected

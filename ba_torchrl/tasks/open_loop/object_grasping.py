@@ -23,11 +23,11 @@ PALM_GAP_M = 5e-3
 FLOOR_GAP_M = 1.5e-3
 """Least gap between the fingertips and the floor of the tray, for picks without z."""
 WINDOW_M = 0.0125
-"""Half the width of the window that is searched for the highest point: that of a finger."""
+"""Half the width of the window that is searched for the highest point: half a finger's."""
 SLIP_COST = 30.0
 """Cost of the slip score of a grasp; fitted to picks of random grasps."""
 HEIGHT_ERROR_COST_PER_M = 4500.0
-"""Cost of the difference between the height of a grasp and that of a pick without z at its
+"""Cost of the difference between a grasp's height and the height of a pick without z at its
 position; fitted to picks of random grasps."""
 
 

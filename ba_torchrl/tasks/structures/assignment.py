@@ -50,7 +50,7 @@ def read_piece_states(
 
     Args:
         ground: PyBullet ids of the bodies that form the ground.
-        base: those of them on which a structure may stand.
+        base: ids among ``ground`` on which a structure may stand.
         block_m: edge of a block. A support is at least half of it lower than the piece.
     """
     by_id = {body.id: body for body in pieces}
@@ -156,7 +156,7 @@ class SlotAssigner:
                 yield body
 
     def _fits(self, body: Body, number: int, assignment: Assignment) -> bool:
-        """Whether the state of a body is that of a piece in a slot."""
+        """Whether a body is where a piece in a slot would be."""
         slot, state = self.blueprint.slots[number], self.states[body]
         supports = [assignment[i] for i in slot.on]
         if state.tilt_rad >= UPRIGHT_RAD:

@@ -43,8 +43,8 @@ class CloseLoopStructureTask(StructureGoal, CloseLoopTask):
         3: Spacing(2.4, 2.4),
         4: Spacing(1.6, 2.0),
     }
-    """Space around each piece at the start, in blocks, by the number of pieces; that of the largest
-    number also for more."""
+    """Space around each piece at the start, in blocks, by the number of pieces; the largest
+    number's also for more."""
 
     def load_scene(self) -> None:
         """Load the pieces."""

@@ -70,7 +70,7 @@ class Deconstruction(OpenLoopTask):
         self.finger_opening = task.finger_opening
 
     def load_scene(self) -> None:
-        """Load nothing; the pieces are those of the structure task."""
+        """Load nothing; the structure task has the pieces."""
 
     def choose_objects(self, rng: np.random.Generator) -> None:
         """Draw the pieces of an episode of the task."""
@@ -198,7 +198,7 @@ class Deconstruction(OpenLoopTask):
         center: tuple[float, float] | None,
         rng: np.random.Generator,
     ) -> None:
-        """Place a body in its slot, after those of all earlier slots.
+        """Place a body in its slot, after the bodies of all earlier slots.
 
         Args:
             center: point of the ground for a slot without supports; for one of two supports of a
@@ -321,7 +321,7 @@ class Deconstruction(OpenLoopTask):
         return place
 
     def _tool_yaw(self, held: Body, tool_yaw_rad: float, rng: np.random.Generator) -> float:
-        """Return the yaw of the gripper for a place: random, or that of the fixed orientation."""
+        """Return the yaw of the gripper for a place: random, or the fixed orientation's."""
         if not self.action_limits.turn_rad:
             return 0.0
         if self.settings.random_orientation:
@@ -354,7 +354,7 @@ class UndoRecorder(NamedTuple):
 
         A pick is undone by a place at the pose from which the body was picked, a place by a pick at
         the pose where the body came to rest. Both use the grasp of the body, so the tool pose
-        differs from that of the action if the body slipped or settled.
+        differs from the action's if the body slipped or settled.
 
         Args:
             held: the body in the gripper now.

@@ -36,7 +36,7 @@ HIGH = (1.2, 1.32)
 CUBOID_M = ((0.025, 0.035), (0.075, 0.105), (0.02, 0.035))
 """Range of each edge of a random cuboid."""
 SHAPE_GAP_M = (-0.02, 0.008, 0.02)
-"""Gap between the two shapes under a bridge, along the line between their centres: least, that of
+"""Gap between the two shapes under a bridge, along the line between their centres: least, from
 the expert, largest. It is negative if the shapes stand obliquely side by side."""
 START_GAP_M = 0.015
 """Least gap between the bounding circles of two pieces at the start."""

@@ -54,7 +54,7 @@ class Grasps:
         return body.position[2] - vertical_extent(body)[0]
 
     def pick_cost_m(self, body: Body) -> float:
-        """Return the cost of picking a piece, as a distance that is added to that of its move."""
+        """Return the cost of picking a piece, a distance that is added to the move's distance."""
         return 0.0
 
     def site_deficit_m(self, sites: np.ndarray, rest: Sequence[Body]) -> np.ndarray:

@@ -140,7 +140,7 @@ class Quality(NamedTuple):
     centering_m: float
     """How close the grasp is to the centre, at most 0."""
     clearance_m: float
-    """The clearance including that of the near finger."""
+    """The clearance, the near finger's included."""
 
 
 class PickPlaceGrasps(Grasps):

@@ -81,7 +81,7 @@ class Repair:
 
 @dataclass
 class _GraspBlocking:
-    """Which pieces block the grasps of which others."""
+    """Which pieces block the grasp of another piece."""
 
     pieces: Iterable[Body]
     above: Mapping[Body, frozenset[Body]]

@@ -24,7 +24,7 @@ PYRAMIDS_PER_ROW = 3
 BASE_SHARE = 0.5
 """Edge of a pyramid's base, as a multiple of the workspace's width."""
 VARIANTS = 27
-"""Pyramids of evenly spaced slopes, of which every episode uses nine."""
+"""Pyramids of evenly spaced slopes; every episode uses nine of them."""
 UNDERGROUND_M = 0.02
 """Depth of the pyramids' bases below the ground, so that the shallowest has a thickness."""
 FRICTION = 1.0
@@ -50,7 +50,7 @@ class Bumps(SlopedTerrain):
 
     Args:
         world: not sealed yet.
-        workspace: bounds of the task; its centre is that of the pyramids.
+        workspace: bounds of the task; the pyramids have its centre.
         platform_m: extents of the platform along its x and y axis.
         random_orientation: whether the platform has a random heading.
     """

@@ -23,7 +23,7 @@ SLOPE_RAD = (0.0, math.pi / 6)
 EDGE_M = (0.0, 0.01)
 """Range of the height of each ramp's lower edge above the ground."""
 OFFSET_SHARE = 0.25
-"""Largest offset of the centre of the gap from that of the workspace, as a multiple of the
+"""Largest offset of the gap's centre from the workspace's, as a multiple of the
 difference between the widest and the present gap."""
 BORDER_M = 0.03
 """Distance by which the ramps extend beyond the corners of the workspace."""

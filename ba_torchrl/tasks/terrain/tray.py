@@ -19,7 +19,7 @@ from ba_torchrl.tasks.workspace import Workspace
 FLOOR_Z_M = 2e-3
 """Height of the base."""
 MARGIN_M = 0.05
-"""Width of the workspace minus that of the base, which lip and walls surround."""
+"""Workspace's width minus the base's, which lip and walls surround."""
 LIP_M = 0.015
 """Horizontal extent of the lip."""
 LIP_RAD = math.radians(20)

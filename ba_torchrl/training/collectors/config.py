@@ -16,7 +16,7 @@ from ba_torchrl.core.registry import Registry
 class CollectorConfig(StrictModel):
     """Options of a collector.
 
-    Its module imports no torch: those of this package name in `starter` what starts to collect.
+    Its module imports no torch: this package's classes name in `starter` what starts to collect.
     Another one can override `start` instead.
     """
 

@@ -57,7 +57,7 @@ class MultiCollection(WorkerCollection):
     """Batches of worker processes: of all workers if they are synchronous, else of one of them.
 
     If a worker process ends, all are replaced, and their episodes in progress are lost. An error of
-    the code in a worker, such as that of a task, is raised instead.
+    the code in a worker, such as a task's, is raised instead.
     """
 
     def __init__(
@@ -254,7 +254,7 @@ def _killed_after(seconds: float, find: Callable[[], Iterable[BaseProcess]]) -> 
 
 @contextlib.contextmanager
 def _start_method(method: str) -> Iterator[None]:
-    """Context in which processes start as ``method`` says, including those of TorchRL."""
+    """Context in which processes start as ``method`` says, TorchRL's included."""
     before = mp.get_start_method(allow_none=True)
     mp.set_start_method(method, force=True)
     try:

@@ -129,7 +129,7 @@ def plan(
 ) -> list[ExperimentConfig]:
     """Return every run of a grid, after one environment and learner of each kind was made.
 
-    Args, order and errors are those of `expand`.
+    Args, order and errors are as in `expand`.
     """
     runs = expand(config, common, preset)
     _check_parts(runs)
@@ -144,7 +144,7 @@ def expand(
     Args:
         config: the grid.
         common: fields of `ExperimentConfig` that all runs share. ``algorithm`` and ``network`` hold
-            fields without a ``name``, which override those of every preset.
+            fields without a ``name``, which override every preset's.
         preset: loads the presets.
 
     Returns:

@@ -30,7 +30,7 @@ class Grid:
 class LauncherConfig(StrictModel):
     """Options of a launcher.
 
-    Its module imports no torch: those of this package name in `runner` what runs the grid. Another
+    Its module imports no torch: this package's classes name in `runner` what runs the grid. Another
     one can override `run_all` instead.
     """
 
