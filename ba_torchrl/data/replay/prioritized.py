@@ -106,6 +106,11 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         buffers pass it for transitions without a TD error, in tensors of several types."""
         return -math.inf
 
+    def __repr__(self) -> str:
+        names = ("alpha", "beta", "eps", "expert_bonus")
+        values = ", ".join(f"{name}={getattr(self, name)}" for name in names)
+        return f"{type(self).__name__}({values})"
+
     def anneal(self, fraction: float) -> None:
         """Interpolate beta between its initial value and one; an initial value of zero is kept.
 
@@ -215,16 +220,17 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         return self.expert_bonus * stored_flags(storage, self.expert_key, index).to(self.dtype)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return priorities and exponent, as tensors and numbers."""
+        """Return priorities and exponents, as tensors and numbers."""
         everything = torch.arange(self.max_size, device="cpu")
         return {
             "leaves": torch.as_tensor(self._sum_tree[everything], device="cpu").reshape(-1).clone(),
             "max_priority": (self._largest, None),  # and TorchRL's index of it, which nothing reads
+            "alpha": self.alpha,
             "beta": self.beta,
         }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """Restore priorities and exponent, from any device.
+        """Restore priorities and exponents, from any device.
 
         Args:
             state_dict: of a sampler of the same capacity.
@@ -243,6 +249,8 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             self._sum_tree[written] = leaves[written]
             self._min_tree[written] = leaves[written]
         self._largest = state_dict["max_priority"][0] or 1.0
+        # not by the property, which would transform the leaves; saved runs may lack the entry
+        self._alpha = state_dict.get("alpha", self._alpha)
         self.beta = state_dict["beta"]
 
 

@@ -321,6 +321,8 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
     buffer, sampler = make(FLAGS, capacity=12)
     sampler.anneal(0.25)
     buffer.update_priority(torch.arange(8), torch.tensor(ERRORS))
+    sampler.alpha = 0.5  # as by a scheduler of TorchRL
+    assert leaves(sampler, 8) == pytest.approx(formula(ERRORS, FLAGS, 1.0, alpha=0.5))
     buffer.sample()
     state = copy.deepcopy(sampler.state_dict())
     draws = torch.Generator().set_state(buffer._rng.get_state())
@@ -337,6 +339,8 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
     largest, place = restored.state_dict()["max_priority"]
     assert (largest, place) == sampler.state_dict()["max_priority"]
     assert largest == pytest.approx(2.0 + EPS)
+    assert repr(restored) == repr(sampler)
+    assert "alpha=0.5, beta=0.55, eps=1e-06, expert_bonus=1.0" in repr(sampler)
     _, wrong = make(FLAGS)
     with pytest.raises(ValueError, match="capacity"):
         wrong.load_state_dict(state)
