@@ -378,6 +378,6 @@ def _observed(found: Mapping[str, Any], names: Iterable[str], kind: str) -> dict
     if missing := [name for name in names if name not in found]:
         raise ConfigError(
             f"the network sees {', '.join(missing)}; the environment observes "
-            f"{', '.join(found) or f'no {kind}'}. env.observations adds some"
+            f"{', '.join(found) or f'no {kind}'}. Set 'env.observations=[{','.join(missing)}]'"
         )
     return {name: found[name] for name in names}

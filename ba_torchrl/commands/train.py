@@ -38,6 +38,8 @@ def parse(values: dict[str, Any], arguments: Arguments) -> ExperimentConfig:
         exists = (Path(folder) / CONFIG_FILE).exists()
         is_folder_alone = arguments.config_name is None and not arguments.presets
         if is_folder_alone and arguments.names <= NON_LEARNING_FIELDS:
+            if "run_dir" not in arguments.names:
+                raise ConfigError("resume=true needs run_dir=FOLDER, the run to continue")
             if not exists:
                 raise ConfigError(f"there is no run in {folder} to resume")
             return read_config(folder, **{name: values[name] for name in arguments.names})

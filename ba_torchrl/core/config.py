@@ -161,7 +161,7 @@ def explain(
             if kind == "tuple_type":
                 message = "Input should be a list"
             given = repr(item["input"])
-            is_short = names and len(given) < 80
+            is_short = names and len(given) < 80 and str(item["input"]) not in message
             text = f"{field}: {message}" + (f" (got {given})" if is_short else "")
         problems.append((field, text))
     return SettingsError(what, name, problems)

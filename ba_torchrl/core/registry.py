@@ -121,8 +121,8 @@ class Registry(Generic[T]):
             return self._entries[name]
         except (KeyError, TypeError):  # a list is not hashable
             hint = (
-                ". Entries from outside the package are known once their module is imported "
-                "(recipes: 'plugins=[module]'; worker processes: register_modules=[module])"
+                ". To use your own, import its module first (commands: 'plugins=[module]'; "
+                "worker processes: register_modules=[module])"
             )
             raise UnknownNameError(self.kind, name, self, hint) from None
 

@@ -245,9 +245,7 @@ def _check_task_supports(task_id: str, config: EnvConfig) -> None:
         allowed = str(least) if least == most else f"{least} to {most}"
         if numbers.step > 1:
             allowed = f"{', '.join(map(str, numbers[:-1]))} or {numbers[-1]}"
-        raise ConfigError(
-            f"num_objects: {task_id} takes {allowed} objects, not {config.num_objects}"
-        )
+        raise ConfigError(f"num_objects: {task_id} has {allowed}, not {config.num_objects}")
     if config.reward != "sparse" and task_class.progress is Task.progress:
         dense = ", ".join(name for name in TASKS if TASKS[name].progress is not Task.progress)
         raise ConfigError(f"reward: {task_id} has no dense reward; it is for {dense}")

@@ -200,6 +200,8 @@ def test_the_folder_alone_resumes_a_run(tmp_path, caplog):
     new = {**values, "run_dir": str(tmp_path / "other")}
     with pytest.raises(ConfigError, match=rf"^there is no run in {new['run_dir']} to resume$"):
         train.parse(new, given)
+    with pytest.raises(ConfigError, match="needs run_dir=FOLDER"):
+        train.parse(values, Arguments({"resume": True}))
     assert train.parse(new, everything).total_updates == 99
     assert f"there is no run in {new['run_dir']} to resume: a new one starts" in caplog.text
 

@@ -25,7 +25,7 @@ def test_render_needs_a_display(make, monkeypatch):
         (PICKING, {"asset_root": "somewhere"}, "no meaning"),
         ("close_loop/block_stacking", {"object_type": "cylinder"}, "no meaning"),
         ("open_loop/block_stacking", {"object_type": "ball"}, "'cube' or 'cylinder'"),
-        (PICKING, {"num_objects": 2}, "takes 1 "),
+        (PICKING, {"num_objects": 2}, "has 1, not 2"),
         ("close_loop/house_building", {"num_objects": 5}, "2 to 4"),
         (PICKING, {"solver_iterations": 10}, "physics_mode='custom'"),
         (PICKING, {"physics_mode": "custom"}, "time_step_s"),

@@ -56,7 +56,7 @@ def test_scattered_objects_keep_clearance(make_env):
     [
         (BIN, 11, "num_objects"),
         (BOTTLES, 5, "num_objects"),
-        (BOXES, 7, "6, 12 or 18 objects, not 7"),
+        (BOXES, 7, "6, 12 or 18, not 7"),
         (BOXES, 24, "num_objects"),
         (BOXES, 1, "num_objects"),
     ],
