@@ -180,6 +180,9 @@ class LevelDQNLoss(TransitionLoss):
             of `ba_torchrl.objectives.base.TransitionLoss`; the formulas above are for the reduction
             "mean".
 
+    Raises:
+        ValueError: ``demonstrations`` is unknown, or the margin is negative.
+
     Examples:
         >>> import torch
         >>> from torchrl.modules import QValueActor
@@ -226,6 +229,8 @@ class LevelDQNLoss(TransitionLoss):
         **options: Any,
     ) -> None:
         check_choice("demonstrations", demonstrations, Demonstrations)
+        if margin < 0:
+            raise ValueError(f"margin must not be negative, got {margin}")
         super().__init__(**options)
         value_network = as_levels(value_network)
         self.demonstrations = demonstrations

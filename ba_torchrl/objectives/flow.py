@@ -38,6 +38,9 @@ class FlowMatchingLoss(ImitationLoss):
         draws: noises and times for each chunk.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
 
+    Raises:
+        ValueError: there are no draws.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -78,6 +81,8 @@ class FlowMatchingLoss(ImitationLoss):
         draws: int = 4,
         reduction: Reduction | None = None,
     ) -> None:
+        if draws < 1:
+            raise ValueError(f"draws must be at least 1, got {draws}")
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
         self.draws = draws

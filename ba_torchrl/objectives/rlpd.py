@@ -35,6 +35,9 @@ class RLPDLoss(SACfDLoss):
         demonstration_weight: weight of the behaviour term, which RLPD does not have.
         options: of `SACfDLoss`.
 
+    Raises:
+        ValueError: the subset is empty, or as for `SACfDLoss`.
+
     Examples:
         >>> import torch
         >>> from tensordict import TensorDict
@@ -71,6 +74,8 @@ class RLPDLoss(SACfDLoss):
         demonstration_weight: float = 0.0,
         **options: Any,
     ) -> None:
+        if subset < 1:
+            raise ValueError(f"subset must be at least 1, got {subset}")
         super().__init__(
             actor_network,
             encoder_network,

@@ -292,6 +292,19 @@ def test_a_reset_names_the_modules_that_it_cannot_reset(monkeypatch):
         make("bc").reset_parameters_recursive()
 
 
+@pytest.mark.parametrize(
+    ("make_loss", "message"),
+    [
+        (lambda: flow(draws=0), "draws must be at least 1, got 0"),
+        (lambda: sac(RLPDLoss, 3, subset=0), "subset must be at least 1, got 0"),
+        (lambda: levels(margin=-0.1), "margin must not be negative, got -0.1"),
+    ],
+)
+def test_numbers_without_a_meaning_are_refused(make_loss, message):
+    with pytest.raises(ValueError, match=message):
+        make_loss()
+
+
 @every_loss
 def test_a_loss_computes_in_the_type_of_its_parameters(name):
     loss, data = make(name).double(), in_type(data_of(name), torch.float64)
