@@ -112,6 +112,7 @@ LEARNERS = {
     "rlpd cnn": {},
     "rlpd equi": {},
     "bc equi": {},
+    "flow equi": {"rotation": {"name": "sampled"}, "optimizer": {"policy_average": 0.9}},
     "dagger equi_asr": {"rotation": {"name": "se2"}, "beta_init": 0.0},
     "spatial_q asr": {"rotation": {"name": "d4"}, "epsilon_init": 0.5},
     "spatial_q fcn": {},
@@ -147,6 +148,7 @@ RETURNED = {
 QUICK = (
     "policy, Equi",
     "learner, rlpd cnn",
+    "learner, flow equi",
     "learner, spatial_q asr",
     "environment, close loop",
     "vector in this process",

@@ -53,13 +53,17 @@ def as_transitions(
     return out
 
 
-def chunk_windows(actions: Tensor, is_known: Tensor, horizon: int) -> tuple[Tensor, Tensor]:
+def chunk_windows(
+    actions: Tensor, is_known: Tensor, is_executed: Tensor, horizon: int
+) -> tuple[Tensor, Tensor]:
     """Return the next actions from each step of an episode, and which of them count.
 
     Args:
-        actions: of the steps of one episode, [N, A].
-        is_known: whether a step's action is to be imitated, [N]. From the first one that is not, a
-            chunk does not count.
+        actions: to imitate in the steps of one episode, [N, A].
+        is_known: whether a step has such an action, [N]. From the first step without one, a chunk
+            does not count.
+        is_executed: whether a step executed its action, [N]. After the first step that did not, a
+            chunk does not count: the action does not lead to the states that follow.
         horizon: number T of actions in a chunk.
 
     Returns:
@@ -67,5 +71,7 @@ def chunk_windows(actions: Tensor, is_known: Tensor, horizon: int) -> tuple[Tens
     """
     index = torch.arange(len(actions), device="cpu")[:, None] + torch.arange(horizon, device="cpu")
     inside = index.clamp(max=len(actions) - 1)
-    is_valid = (index < len(actions)) & is_known[inside]
-    return actions[inside], is_valid.cumprod(dim=1).bool()
+    is_valid = ((index < len(actions)) & is_known[inside]).cumprod(dim=1).bool()
+    leads_on = is_executed[inside].cumprod(dim=1).bool()
+    is_valid[:, 1:] &= leads_on[:, :-1]
+    return actions[inside], is_valid

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
-from torch import nn
+import torch
+from torch import Tensor, nn
+from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.config import NETWORKS, NetworkConfig
 
-__all__ = ["NETWORKS", "ActorCritic", "ActorCriticSpec", "NetworkConfig"]
+__all__ = ["NETWORKS", "ActorCritic", "ActorCriticSpec", "Frames", "NetworkConfig"]
 
 ACTION_LETTERS = "pxyzr"
 """Close-loop action components: p gripper, x y z displacement, r yaw."""
@@ -70,8 +72,31 @@ class ActorCriticSpec:
         return len(self.action_sequence)
 
 
-class ActorCritic(NamedTuple):
-    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, even none."""
+class Frames(NamedTuple):
+    """How an encoder's features, and the action, move under the elements of a group.
+
+    The features are fields with a component for each of the G elements, then V components of
+    vectors.
+    """
+
+    action: Tensor
+    """Representation on the action, [G, A, A], in the order of a field's components."""
+    vectors: Tensor
+    """Representation on the components of vectors, [G, V, V]."""
+
+    @classmethod
+    def without_symmetry(cls, spec: ActorCriticSpec) -> Self:
+        """Return those of features that end in the specification's vectors, unchanged."""
+        sizes = (spec.action_size, spec.vector_size)
+        return cls(*(torch.eye(size, dtype=torch.float32, device="cpu")[None] for size in sizes))
+
+
+@dataclass(frozen=True)
+class ActorCritic:
+    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, even none.
+
+    Iterating over it gives the modules.
+    """
 
     actor: nn.Module
     """(images [..., C, H, W] each, holding [..., 1], vectors [..., V] each) -> (loc [..., A],
@@ -81,3 +106,9 @@ class ActorCritic(NamedTuple):
     critic: nn.Module
     """(features [..., F], action [..., A]) -> twin values [..., 2], or [..., K] if the
     specification asks for K critics."""
+    frames: Frames | None = None
+    """What the features of `encoder` are, for heads that are equivariant as it is; None if they
+    have no symmetry."""
+
+    def __iter__(self) -> Iterator[nn.Module]:
+        return iter((self.actor, self.encoder, self.critic))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 
 import torch
 import torch.nn.functional as F
@@ -14,7 +15,9 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.core.generators import seeded_generator
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, Frames
 
 _FREQUENCIES = 8
 _FASTEST = 50.0
@@ -78,6 +81,30 @@ class ChunkHead(nn.Module):
         out = self.layers(torch.cat([image, vector, turned, encoded], dim=-1))
         out = out.unflatten(-1, (self.horizon, size))
         return torch.einsum("gab,...gtb->...ta", self.frames, out) / group
+
+
+def chunk_head(
+    networks: ActorCritic, spec: ActorCriticSpec, horizon: int, hidden: int = 256
+) -> ChunkHead:
+    """Return a head for the features of an actor-critic network's encoder.
+
+    Args:
+        networks: freshly built. With `ActorCritic.frames` of a group, the head is equivariant as
+            the encoder is.
+        spec: for which they were built.
+        horizon: number of actions in a chunk.
+        hidden: units of both hidden layers.
+    """
+    images = [image.to_tensor_spec().zero()[None] for image in spec.images.values()]
+    holding = torch.zeros(1, 1, dtype=torch.bool, device="cpu")
+    vectors = [
+        torch.zeros(1, size, dtype=torch.float32, device="cpu") for size in spec.vectors.values()
+    ]
+    with torch.no_grad():
+        features = evaluation_copy(networks.encoder)(*images, holding, *vectors)
+    frames = networks.frames or Frames.without_symmetry(replace(spec, vectors={}))
+    fields = (features.shape[-1] - frames.vectors.shape[-1]) // len(frames.action)
+    return ChunkHead(fields, *frames, horizon, hidden)
 
 
 def encoded_time(time: Tensor) -> Tensor:

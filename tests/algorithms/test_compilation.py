@@ -62,6 +62,7 @@ def assert_one_graph(loss, batch):
         ("sac", "equi", SACFD),
         ("bc", "cnn", {}),
         ("dagger", "cnn", {}),
+        ("flow", "equi", {}),
     ],
 )
 @pytest.mark.parametrize("precision", ["auto", "float32"])

@@ -34,9 +34,10 @@ def parameters(learner):
         ("cnn", {"name": "iql"}, {"pretrain_updates": 1}),
         ("cnn", {"name": "bc"}, {}),
         ("cnn", {"name": "dagger"}, {}),
+        ("equi", {"name": "flow", "rotation": {"name": "sampled"}}, {}),
         ("asr", {"name": "spatial_q"}, OPEN),
     ],
-    ids=["sacfd cnn", "sacfd equi", "rlpd", "iql", "bc", "dagger", "sdqfd asr"],
+    ids=["sacfd cnn", "sacfd equi", "rlpd", "iql", "bc", "dagger", "flow equi", "sdqfd asr"],
 )
 def test_a_run_learns_on_the_device_and_its_state_loads_on_the_cpu(
     network, algorithm, changes, tmp_path, cuda

@@ -75,6 +75,7 @@ CASES = [
     ("bc", "cnn", {}, {"actor_network": 1}),
     ("bc", "asr", {}, {"value_network": 1}),
     ("dagger", "cnn", {"optimizer": {"policy_average": 0.5}}, {"actor_network": 1}),
+    ("flow", "cnn", {"optimizer": {"policy_average": 0.5}}, {"actor_network": 1}),
     ("iql", "cnn", {}, {"actor_network": 1, "qvalue_network": 1, "value_network": 1}),
     # the critics' features are also those of the policy's term; its values are of other actions
     ("sac", "cnn", {}, {"actor_network": 1, "encoder_network": 1, "qvalue_network": 2}),
@@ -94,7 +95,7 @@ def test_only_updates_are_in_training_mode(algorithm, network, settings, counts)
         if name.endswith("num_batches_tracked"):
             part = name.split("_params")[0]
             assert (value == counts.get(part, int(not part.startswith("target")))).all(), name
-    seen = transitions(learner).select(*learner.observation_keys)
+    seen = transitions(learner).select(*learner.policy.in_keys)
     before = buffers(learner.loss), buffers(learner.policy)
     learner.policy.train()
     with set_exploration_type(ExplorationType.DETERMINISTIC):

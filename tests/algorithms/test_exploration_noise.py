@@ -63,7 +63,7 @@ def test_actions_stay_in_their_range():
     assert found.max() == 1
 
 
-@pytest.mark.parametrize("name", ["bc", "iql", "rlpd", "sac"])
+@pytest.mark.parametrize("name", ["bc", "flow", "iql", "rlpd", "sac"])
 @pytest.mark.parametrize("kind", [ExplorationType.RANDOM, ExplorationType.DETERMINISTIC, None])
 def test_noise_of_ones_own_acts_under_random_only(own_noise, name, kind):
     learner = build(name)

@@ -153,6 +153,7 @@ class ReadsOnTheHost(TorchDispatchMode):
         ("rlpd", "cnn", {"replay": {"name": "symmetric"}}),
         ("bc", "cnn", {}),
         ("dagger", "cnn", {}),
+        ("flow", "equi", {}),
     ],
 )
 def test_the_host_reads_no_result_during_an_update(algorithm, network, settings):

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.core import keys
 from tests.algorithms.tiny import build, transitions
 
-ALGORITHMS = ["sac", "bc", "rlpd", "iql"]
+ALGORITHMS = ["sac", "bc", "rlpd", "iql", "flow"]
 
 
 def averaged(name, decay=0.5):
@@ -53,7 +53,7 @@ def test_the_average_is_restored_from_the_state(name):
         learner.update()
     other = averaged(name)
     other.load_state_dict(learner.state_dict())
-    state = transitions(learner).select(*learner.observation_keys)
+    state = transitions(learner).select(*learner.policy.in_keys)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         a, b = (each.policy(state.clone())[keys.ACTION] for each in (learner, other))
     assert torch.equal(a, b)

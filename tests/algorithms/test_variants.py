@@ -43,6 +43,7 @@ PAIRS = {
     "dqn": "fcn",
     "drq": "equi",
     "ferm": "ferm",
+    "flow": "equi",
     "ferm_per": "ferm",
     "iql": "equi",
     "rad": "cnn",
@@ -113,7 +114,7 @@ def check_two_updates(preset, network):
         convolutions = {name for name in after if ".convs." in name}
         assert convolutions
         assert convolutions <= changed
-    state = transitions(algorithm).select(*algorithm.observation_keys)
+    state = transitions(algorithm).select(*algorithm.policy.in_keys)
     with set_exploration_type(ExplorationType.DETERMINISTIC):
         assert algorithm.policy(state)[keys.ACTION].isfinite().all()
 
@@ -176,7 +177,7 @@ def test_a_contrastive_loss_on_an_encoder_that_the_policy_does_not_share_gives_a
     assert "contrastive has no effect on the encoder of the policy of 'cnn'" in caplog.text
 
 
-@pytest.mark.parametrize("preset", ["bc", "dagger"])
+@pytest.mark.parametrize("preset", ["bc", "dagger", "flow"])
 def test_imitation_trains_the_convolutions_of_ferm(preset):
     imitator = build(preset, "ferm")
     imitator.extend(transitions(imitator))
@@ -250,6 +251,7 @@ def test_copies_and_conversions_of_the_loss_share_the_encoder_too(change):
     [
         *(("sac", "cnn"), ("sacfd", "equi"), ("drq", "cnn"), ("ferm", "ferm"), ("rlpd", "cnn")),
         *(("bc", "cnn"), ("bc", "asr"), ("sdqfd", "equi_asr")),
+        ("flow", "cnn"),
     ],
 )
 def test_the_loss_takes_tensors_by_name(preset, network):

@@ -278,6 +278,7 @@ def test_no_two_uses_of_randomness_draw_the_same_numbers(replay):
         ("rlpd", "cnn", {}),
         ("iql", "cnn", {}),
         ("bc", "asr", {}),
+        ("flow", "equi", {}),
         ("spatial_q", "asr", {}),
     ],
 )

@@ -85,6 +85,11 @@ def transitions(learner, count=24):
         keys.IS_DEMONSTRATION: torch.arange(count)[:, None] % 2 == 0,
         keys.NEXT: following,
     }
+    if keys.STEP_COUNT in learner.policy.in_keys:  # of chunks
+        size = (learner.config.horizon, learner.problem.actions.size)
+        data[keys.TARGET_CHUNK] = 1.8 * rand(*size) - 0.9
+        data[keys.TARGET_CHUNK_MASK] = rand(size[0]) < 0.7
+        data[keys.STEP_COUNT] = torch.zeros(count, 1, dtype=torch.int64)
     data = TensorDict(data, [count])
     if learner.problem.control == "open_loop":
         low, high = torch.tensor(learner.problem.actions.ranges).T

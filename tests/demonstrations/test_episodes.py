@@ -215,9 +215,12 @@ def test_a_restored_state_continues_the_episodes():
     assert (one == other).all()
 
 
-def test_a_chunk_ends_with_its_episode_and_before_an_unknown_action():
-    actions = torch.arange(5.0)[:, None]
-    chunks, is_valid = chunk_windows(actions, torch.tensor([1, 1, 1, 0, 1]).bool(), 3)
+def test_a_chunk_ends_with_its_episode_and_where_the_expert_did_not_act():
+    actions, known = torch.arange(5.0)[:, None], torch.tensor([1, 1, 1, 0, 1]).bool()
+    chunks, is_valid = chunk_windows(actions, known, known, 3)
     rows = [[0, 1, 2], [1, 2, 3], [2, 3, 4], [3, 4, 4], [4, 4, 4]]
     assert chunks.squeeze(-1).tolist() == rows
     assert is_valid.int().tolist() == [[1, 1, 1], [1, 1, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0]]
+    # known everywhere, and a random action in its place at the second step
+    _, is_valid = chunk_windows(actions, known | True, torch.tensor([1, 0, 1, 1, 1]).bool(), 3)
+    assert is_valid.int().tolist() == [[1, 1, 0], [1, 0, 0], [1, 1, 1], [1, 1, 0], [1, 0, 0]]

@@ -12,7 +12,7 @@ from ba_torchrl.modules.actor_critic.cnn_config import CNNConfig
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
 from ba_torchrl.modules.actor_critic.trunk import ImageTrunk, scale_from_log_std, trunk_stages
-from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, Frames
 from ba_torchrl.modules.layers import CastConv2d, XavierInitialised, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 128)
@@ -93,6 +93,7 @@ def build_cnn(config: CNNConfig, spec: ActorCriticSpec) -> ActorCritic:
         actor=PlainActor(trunk, nn.Identity(), loc, log_std),
         encoder=_trunk(config, spec),
         critic=_critic(config, spec, features),
+        frames=Frames.without_symmetry(spec),
     )
     for network in networks:
         network.reset_parameters()

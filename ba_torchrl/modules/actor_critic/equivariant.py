@@ -18,7 +18,7 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.modules.actor_critic.critics import EnsembleCritic
 from ba_torchrl.modules.actor_critic.equivariant_config import EquivariantConfig
 from ba_torchrl.modules.actor_critic.trunk import ImageTrunk, scale_from_log_std, trunk_stages
-from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, Frames
 from ba_torchrl.modules.steerable.layers import (
     FieldTypes,
     SteerableConv2d,
@@ -73,6 +73,10 @@ class ActionFields:
     def ungroup(self, fields: Tensor) -> Tensor:
         """Return the components [..., A] of [vector, signed, invariants] in the action's order."""
         return torch.stack([fields[..., i] for i in self._restore], dim=-1)
+
+    def matrices(self, group: PlanarGroup) -> Tensor:
+        """Return the matrices [G, A, A] of the group's elements, in the action's order."""
+        return _matrices(self.types(group), group)[:, self._restore][:, :, self._restore]
 
 
 class PoseFields:
@@ -230,7 +234,19 @@ def build_equivariant(config: EquivariantConfig, spec: ActorCriticSpec) -> Actor
         actor=actor,
         encoder=EquivariantEncoder(encoder, pose) if spec.vectors else encoder,
         critic=_critic(features, action, spec.critics),
+        frames=Frames(action.matrices(group), _matrices(pose.types(group), group)),
     )
+
+
+def _matrices(types: FieldTypes, group: PlanarGroup) -> Tensor:
+    """Return the matrices [G, N, N] of the group's elements for fields that are irreps."""
+    irreps = [rep.irreps[0] for rep, count in types for _ in range(count)]
+    none = torch.zeros(0, 0, dtype=torch.float64, device="cpu")
+    found = [
+        torch.block_diag(none, *(torch.from_numpy(group.matrix(each, element)) for each in irreps))
+        for element in group.elements
+    ]
+    return torch.stack(found).float()
 
 
 def _critic(features: FieldTypes, action: ActionFields, critics: int | None) -> nn.Module:

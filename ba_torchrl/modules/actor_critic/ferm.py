@@ -11,7 +11,7 @@ from torch import Tensor, nn
 from ba_torchrl.modules.actor_critic.cnn import PlainActor, PlainTwinCritic, mlp, plain_trunk
 from ba_torchrl.modules.actor_critic.ferm_config import FERMConfig
 from ba_torchrl.modules.actor_critic.trunk import ImageTrunk
-from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec
+from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, Frames
 from ba_torchrl.modules.layers import XavierInitialised, scaled_width
 
 _WIDTHS = (16, 32, 64, 128, 256, 256, 1024)
@@ -49,6 +49,7 @@ def build_ferm(config: FERMConfig, spec: ActorCriticSpec) -> ActorCritic:
         actor=PlainActor(trunk, head, loc, log_std),
         encoder=FERMEncoder(trunk, width, config.features),
         critic=PlainTwinCritic(mlp(features + size, hidden, hidden, 1) for _ in range(2)),
+        frames=Frames.without_symmetry(spec),
     )
     for network in networks:
         network.reset_parameters()
