@@ -201,7 +201,8 @@ class ChunkPolicy(TensorDictModuleBase):
         chunk = tensordict.get(_CARRIED_CHUNK, None)
         if chunk is not None:
             chunk = torch.cat([chunk[..., 1:, :], chunk[..., -1:, :]], dim=-2)
-        if chunk is None or bool(begins.any()):
+        # compiled and exported code has no branch that depends on values
+        if chunk is None or torch.compiler.is_compiling() or bool(begins.any()):
             seen = tensordict.select(*self.in_keys).set(keys.NOISE, self._noise(count.squeeze(-1)))
             new = self.flow(seen)[keys.ACTION_CHUNK]
             chunk = new if chunk is None else torch.where(begins, new, chunk)

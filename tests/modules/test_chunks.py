@@ -1,4 +1,5 @@
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -7,7 +8,11 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.core import keys
-from ba_torchrl.modules.chunks import ChunkFlow, ChunkHead, ChunkPolicy
+from ba_torchrl.modules.base import ActorCriticSpec
+from ba_torchrl.modules.chunks import ChunkFlow, ChunkHead, ChunkPolicy, chunk_head
+from tests.modules.networks import actor_critic
+from tests.modules.test_equivariance import CENTER_M, move_proprio, reflect_action, turn_action
+from tests.specs import close_loop_images
 
 T = 4
 
@@ -100,3 +105,55 @@ def test_the_noise_is_constant_unless_the_policy_explores():
     assert len(drawn.unique()) == 3
     assert torch.equal(drawn, again)
     assert not torch.equal(drawn, other)
+
+
+@pytest.mark.parametrize(
+    ("name", "order", "reflections", "vectors"),
+    [
+        ("equi", 8, False, {}),
+        ("equi", 4, True, {"proprio": 8}),
+        ("equi", 2, False, {"proprio": 8}),
+        ("equi_strided", 4, False, {}),
+    ],
+)
+@torch.no_grad()
+def test_the_chunk_of_a_turned_scene_is_the_turned_chunk(name, order, reflections, vectors):
+    """Of the whole flow, whose noise turns, too."""
+    fields = {"group_order": order, "vectors": vectors, "center_m": CENTER_M}
+    fields |= {"reflections": True} if reflections else {}
+    networks = actor_critic(name, sequence="pxyzr", **fields)
+    spec = ActorCriticSpec(close_loop_images(64), "pxyzr", vectors=vectors)
+    flow = ChunkFlow(networks.encoder, chunk_head(networks, spec, T, hidden=16), steps=2)
+    flow.head.layers[-1].weight *= 0.1  # no action leaves its range
+    depth, holding = torch.rand(2, 1, 64, 64), torch.tensor([[True], [False]])
+    noise = 0.3 * torch.randn(2, T, 5)
+    yaw = torch.tensor([0.3, -1.1])
+    proprio = torch.rand(2, 8)
+    proprio[:, 3:7] = torch.stack([(yaw / 2).cos(), (yaw / 2).sin(), 0 * yaw, 0 * yaw], dim=1)
+    seen = [proprio] if vectors else []
+    chunk = flow(depth, holding, *seen, noise)
+    assert chunk.abs().max() < 1
+    for quarters in range(4) if order > 2 else (0, 2):
+        for flips in (False, True)[: 1 + reflections]:
+
+            def move(action, quarters=quarters, flips=flips):
+                action = reflect_action(action, "pxyzr") if flips else action
+                return turn_action(action, "pxyzr", quarters)
+
+            image = torch.rot90(depth.flip(-1) if flips else depth, quarters, (-2, -1))
+            pose = [move_proprio(each, quarters, flips) for each in seen]
+            moved = flow(image, holding, *pose, move(noise))
+            torch.testing.assert_close(moved, move(chunk), atol=2e-5, rtol=1e-4)
+    if name == "equi":  # the noise alone does not turn the chunk
+        other = flow(depth, holding, *seen, turn_action(noise, "pxyzr", 2))
+        assert not torch.allclose(other, chunk)
+
+
+def test_a_network_without_frames_has_a_head_without_symmetry():
+    networks = replace(actor_critic("cnn", vectors={"proprio": 8}), frames=None)
+    spec = ActorCriticSpec(close_loop_images(64), "pxyzr", vectors={"proprio": 8})
+    head = chunk_head(networks, spec, T)
+    assert head.frames.shape == (1, 5, 5)
+    assert head.vector_frames.numel() == 0
+    features = networks.encoder(torch.rand(3, 1, 64, 64), torch.ones(3, 1) > 0, torch.rand(3, 8))
+    assert head(features, torch.rand(3, T, 5), torch.rand(3)).shape == (3, T, 5)

@@ -156,7 +156,14 @@ FERM = {
 """Optimisers of single terms of the loss, with a schedule."""
 
 
-@pytest.mark.parametrize("changes", [SELF_IMITATION, FERM], ids=["self-imitation", "ferm"])
+FLOW = {
+    "algorithm": {"name": "flow", "batch_size": 4, "optimizer": {"policy_average": 0.9}},
+    "network": {"name": "equi", "group_order": 4, "n_hidden": 4},
+}
+PARTS = {"self-imitation": SELF_IMITATION, "ferm": FERM, "flow": FLOW}
+
+
+@pytest.mark.parametrize("changes", PARTS.values(), ids=PARTS)
 def test_other_parts_of_an_algorithm_continue_with_the_same_bits(tmp_path, changes):
     whole = run(config_for(tmp_path / "whole", **changes))
     experiment = Experiment(config_for(tmp_path / "run", **changes), progress=False)

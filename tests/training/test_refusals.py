@@ -38,7 +38,7 @@ def test_refused_networks_and_algorithms_have_the_names_of_the_registry(tmp_path
     [
         (
             ("algorithm=dqn", "network=equi"),
-            "algorithm 'dqn' learns open_loop tasks.*take algorithm: bc, dagger, drq, ferm, iql",
+            "algorithm 'dqn' learns open_loop tasks.*take algorithm: bc, dagger, drq, ferm, flow, ",
         ),
         (("algorithm=sac", "network=rot_fcn"), "network 'rot_fcn' is for open_loop tasks"),
         (("task=open_loop/block_stacking", *OPEN[1:], "network=equi_d4"), "network 'equi_d4' is"),
