@@ -60,6 +60,12 @@ class LearnerConfig(StrictModel):
         return "executed"
 
     @property
+    def expert_chunk(self) -> int:
+        """Number of the expert's next actions that the environments of demonstrations and
+        collection add to observations (`EnvConfig.expert_chunk`); by default none."""
+        return 0
+
+    @property
     def first_updates(self) -> int:
         """Number of first updates of a run that minimise those of `Learner.make_first_losses`, all
         on the demonstrations; by default none."""

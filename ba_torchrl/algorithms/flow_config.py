@@ -50,3 +50,22 @@ class FlowConfig(LearnerConfig):
                 "of actions in a chunk"
             )
         return self
+
+
+@ALGORITHMS.register("flow_dagger")
+class FlowDAggerConfig(FlowConfig):
+    """Hyper-parameters of DAgger (Ross et al., 2011) on chunks of actions.
+
+    The policy acts after the updates on the demonstrations (``pretrain_updates``). In each state
+    that it visits, the expert plays a chunk of its own, and the simulator then returns to the
+    state, so that the chunk is what the expert would do from there on.
+    """
+
+    learner: ClassVar[str] = "ba_torchrl.algorithms.flow:FlowDAgger"
+    collects: ClassVar[bool] = True
+    imitates: ClassVar[Imitation] = "expert_everywhere"
+
+    @property
+    def expert_chunk(self) -> int:
+        """The chunks' number of actions."""
+        return self.horizon

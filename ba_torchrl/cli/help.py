@@ -84,7 +84,7 @@ def _parts(
         known = isinstance(task, str) and task in TASKS
         model = env_config_model(TASKS[task].Parameters) if known else EnvConfig
         own = {**defaults_of(model), **values["env"]}
-        for name in {"seed", "expert"} - values["env"].keys():
+        for name in {"seed", "expert", "expert_chunk"} - values["env"].keys():
             del own[name]
         yield f"env, the environment{f' of {task}' if known else ''}", model, own, "env."
     for group, registry in registries.items():

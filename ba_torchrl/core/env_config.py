@@ -109,6 +109,10 @@ class EnvConfig(StrictModel):
     """Discount of the learner, for the reward "difference"."""
     expert: bool = False
     """Add the expert's action to every observation."""
+    expert_chunk: int = Field(default=0, ge=0, le=100, json_schema_extra=_CLOSE_LOOP)
+    """Close loop: number of the expert's next actions that are added to every observation, with
+    ``expert``. The expert plays them, and the state is restored; steps take as many times longer,
+    and differ in the last bits from those without it."""
     seed: int | None = Field(default=None, ge=0)
     """Seed of all episodes; drawn at random if None."""
 
@@ -167,6 +171,8 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
         if self.physics_mode == "custom" and not custom:
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
+        if self.expert_chunk and not self.expert:
+            raise ValueError("expert_chunk needs expert=True")
         usual = EnvConfig.model_fields["reward_discount"].default
         if self.reward != "difference" and self.reward_discount != usual:
             raise ValueError("reward_discount has no effect without reward='difference'")

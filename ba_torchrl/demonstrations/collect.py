@@ -102,7 +102,9 @@ def collect_demonstrations(
     if source == "deconstruction":
         return [reverse_episode(episode) for episode in played]
     same_action = () if add_noise is not None else (keys.EXPERT_ACTION,)
-    return [episode.exclude(*same_action, (keys.NEXT, keys.EXPERT_ACTION)) for episode in played]
+    of_next = (keys.EXPERT_ACTION, keys.EXPERT_CHUNK, keys.EXPERT_CHUNK_MASK)
+    others = (*same_action, *((keys.NEXT, key) for key in of_next))
+    return [episode.exclude(*others) for episode in played]
 
 
 class RandomActions:

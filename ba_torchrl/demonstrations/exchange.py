@@ -323,7 +323,7 @@ def _to_episode(form: Format, entries: Mapping[str, Entry], arrays: StoredArrays
 def env_values(task: str, env: dict[str, Any]) -> dict[str, Any]:
     """Return every parameter that affects the data, defaults included, as JSON values."""
     config = resolve_env(task, env).config
-    return json.loads(config.model_dump_json(exclude={"seed", "render", "expert"}))
+    return json.loads(config.model_dump_json(exclude={"seed", "render", "expert", "expert_chunk"}))
 
 
 def check_same_environment(

@@ -19,6 +19,7 @@ from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.checks import ChecksPolicy, check_entries, check_seed, checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
 from ba_torchrl.envs.faults import FaultCounter, check_bodies, check_observation
+from ba_torchrl.envs.look_ahead import expert_chunk
 from ba_torchrl.envs.observations import (
     enabled_observations,
     merge_entries,
@@ -33,6 +34,8 @@ from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
 from ba_torchrl.sim.world import SIMULATOR_ERRORS, Physics, World
 from ba_torchrl.tasks.base import SCALE_STEP, TASKS, Task
 from ba_torchrl.tasks.workspace import ActionLimits
+
+_CHUNK = (keys.EXPERT_CHUNK, keys.EXPERT_CHUNK_MASK)
 
 
 class _OfClass:
@@ -441,6 +444,9 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         general[keys.STEP_COUNT] = Unbounded((1,), device="cpu", dtype=torch.int64)
         if self.config.expert:
             general[keys.EXPERT_ACTION] = action.clone()
+        if horizon := self.config.expert_chunk:
+            general[keys.EXPERT_CHUNK] = action.expand(horizon, *action.shape).clone()
+            general[keys.EXPERT_CHUNK_MASK] = Binary(horizon, device="cpu", dtype=torch.bool)
         extras = merge_entries([extra.specs(largest) for extra in self._observations])
         self.vectors = {
             key: spec.shape[0]
@@ -501,7 +507,12 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
             observation |= extra.observe(scene)
         if self.config.expert:
             with scene.world.fixed_poses():  # experts read the same poses many times
-                observation[keys.EXPERT_ACTION] = torch.from_numpy(self._expert_action(scene))
+                action = self._expert_action(scene)
+            observation[keys.EXPERT_ACTION] = torch.from_numpy(action)
+            if horizon := self.config.expert_chunk:
+                found = expert_chunk(scene, action, horizon, self._act, self._expert_action)
+                for key, value in zip(_CHUNK, found, strict=True):
+                    observation[key] = torch.from_numpy(value)
         check_observation(observation)
         return observation
 

@@ -19,7 +19,8 @@ from ba_torchrl.envs.settings import ResolvedEnv
 EpisodePosition = dict[str, Any]
 """``seed``; ``episode``, the number of the first of some episodes; and ``actions``, float32
 [T, A], of each of them up to the present. They are the current episode and, where it continues with
-the objects of earlier episodes, these as well; none before the first episode and after a fault."""
+the objects of earlier episodes, these as well; none before the first episode and after a fault. A
+collection adds ``carried``, what the policy carries to the next step."""
 
 
 class RecordedPosition:

@@ -29,6 +29,8 @@ INFO_KEYS = (
     keys.FAULT,
     keys.STEP_COUNT,
     keys.EXPERT_ACTION,
+    keys.EXPERT_CHUNK,
+    keys.EXPERT_CHUNK_MASK,
     keys.INSTRUCTION,
 )
 """Entries that are in ``info`` and not in the observation."""
@@ -156,8 +158,9 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         # stack arrays and Python's bools, not NumPy's
         arrays = {key: np.asarray(value) for key, value in values.items()}
         info = {key: a if a.dtype == bool else a[()] for key, a in arrays.items()}
-        if keys.EXPERT_ACTION in state:
-            info[keys.EXPERT_ACTION] = state[keys.EXPERT_ACTION].numpy()
+        for key in (keys.EXPERT_ACTION, keys.EXPERT_CHUNK, keys.EXPERT_CHUNK_MASK):
+            if key in state:
+                info[key] = state[key].numpy()
         return observation, info
 
 

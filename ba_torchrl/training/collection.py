@@ -62,7 +62,8 @@ def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: i
     if values["parallel"] is None and shared_with_other_workers:
         values = {**values, "parallel": False}  # the workers are processes already
     config = _read(values, num_envs=num_envs)
-    return make_env(config, seed, wait_for_restarts=config.wait_for_restarts, expert=expert)
+    labels = {"expert": expert, "expert_chunk": config.algorithm.expert_chunk}
+    return make_env(config, seed, wait_for_restarts=config.wait_for_restarts, **labels)
 
 
 def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:
@@ -102,7 +103,9 @@ def gather_demonstrations(
             )
         return episodes[: config.demonstrations]
     seed = config.derived_seed(SeedUse.DEMONSTRATIONS)
-    env = make_env(config, seed, **source_config(config.demonstrations_source))
+    chunk = config.algorithm.expert_chunk
+    labels = {**source_config(config.demonstrations_source), "expert_chunk": chunk}
+    env = make_env(config, seed, **labels)
     try:
         return collect_demonstrations(
             env,

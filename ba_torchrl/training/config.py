@@ -37,7 +37,7 @@ from ba_torchrl.training.collectors.config import COLLECTORS, CollectorConfig
 if TYPE_CHECKING:
     import torch
 
-SET_BY_THE_EXPERIMENT = ("seed", "expert")
+SET_BY_THE_EXPERIMENT = ("seed", "expert", "expert_chunk")
 """Fields of `EnvConfig` that are not for the user to set."""
 
 

@@ -128,3 +128,16 @@ def test_chunks_turn_with_the_sampled_images():
         others = [0, 3, 4]
         assert torch.equal(chunk[:, others], before[index][:, others])
         assert not torch.allclose(chunk[:, 1:3], before[index][:, 1:3])
+
+
+def test_the_expert_plays_a_chunk_in_the_states_that_the_policy_visits(tmp_path):
+    settings = {"name": "flow_dagger", "horizon": 3}
+    learner = make_experiment(tmp_path, "cnn", settings, demonstrations_noise=0.3)
+    learner.run()
+    stored = learner.learner.replay.storage[:]
+    is_visited = ~stored[keys.IS_DEMONSTRATION].squeeze(-1)
+    assert is_visited.sum() >= 4
+    assert torch.equal(stored[keys.TARGET_CHUNK][:, 0], stored[keys.TARGET_ACTION])
+    assert stored[keys.TARGET_CHUNK_MASK][:, 0].all()
+    assert stored[keys.TARGET_CHUNK_MASK][is_visited].all()  # far from the goal
+    assert not torch.equal(stored[keys.ACTION][is_visited], stored[keys.TARGET_ACTION][is_visited])

@@ -44,6 +44,7 @@ PAIRS = {
     "drq": "equi",
     "ferm": "ferm",
     "flow": "equi",
+    "flow_dagger": "ferm",
     "ferm_per": "ferm",
     "iql": "equi",
     "rad": "cnn",

@@ -136,6 +136,50 @@ def test_an_action_can_be_undone_by_restoring_the_state(make):
     assert torch.equal(tried.reset()["depth"], plain.reset()["depth"])  # the next episode, too
 
 
+@pytest.mark.parametrize(
+    "task",
+    slow_except(
+        [task for task in ba_torchrl.list_tasks() if task.startswith("close_loop/")],
+        ["close_loop/block_in_bowl", "close_loop/drawer_opening"],
+    ),
+)
+def test_the_experts_chunk_is_what_it_does_next_and_leaves_the_state(make, task):
+    env = make(task, obs_size=32, seed=0, expert=True, expert_chunk=3)
+    plain = make(task, obs_size=32, seed=0, expert=True)
+    generator, counts = torch.Generator().manual_seed(0), set()
+    seen, other = env.reset(), plain.reset()
+    for step in range(40):
+        assert (seen.select(*other.keys()) == other).all()
+        poses = [[body.pose for body in each.scene.world.bodies] for each in (env, plain)]
+        assert poses[0] == poses[1]
+        if other["done"]:
+            break
+        kept, ahead, chunk = plain.get_state(), other.clone(), []
+        while len(chunk) < 3 and not (ahead["success"] or ahead["terminated"]):
+            chunk.append(ahead["expert_action"])
+            ahead = plain.step(ahead.set("action", chunk[-1]))["next"]
+        plain.reset(kept, set_state=True)
+        count = len(chunk)
+        counts.add(count)
+        assert torch.equal(seen["expert_chunk"][:count], torch.stack(chunk))
+        assert seen["expert_chunk_mask"].tolist() == [True] * count + [False] * (3 - count)
+        action = other["expert_action"].clone()
+        if step == 2:  # also from a state that the expert does not reach
+            action = torch.rand(action.shape, generator=generator) * 2 - 1
+        seen, other = (
+            each.step(state.set("action", action))["next"]
+            for each, state in ((env, seen), (plain, other))
+        )
+    assert counts == {1, 2, 3}
+
+
+def test_a_chunk_of_nobody_is_refused():
+    with pytest.raises(ConfigError, match="expert_chunk needs expert=True"):
+        ba_torchrl.make("close_loop/block_picking", expert_chunk=3)
+    with pytest.raises(ConfigError, match="'expert_chunk' is for close-loop tasks"):
+        ba_torchrl.make("open_loop/block_stacking", expert=True, expert_chunk=3)
+
+
 def test_a_state_keeps_how_its_episode_ended(make):
     env = make("close_loop/block_picking", obs_size=32, seed=0, max_steps=1)
     last = env.step(env.reset().set("action", torch.zeros(5)))["next"]

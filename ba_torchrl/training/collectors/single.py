@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import torch
-from tensordict import TensorDict
+from tensordict import TensorDict, TensorDictBase
+from tensordict.nn import TensorDictModuleBase
 from torchrl.checkpoint import GlobalRNGState
 from torchrl.collectors import Collector
 
@@ -39,9 +40,12 @@ class SingleCollection(Collection):
         self.env = problem.make_env(problem.num_envs, problem.seed)
         if positions is not None:
             self.env.continue_from(positions)
+        carried = [each[keys.CARRIED] for each in positions or () if keys.CARRIED in each]
+        self._carried = torch.stack([TensorDict(each) for each in carried]) if carried else None
+        """What the policy carried out of the last step of each environment, if anything."""
         self._collector = Collector(
             self.env,
-            problem.learner.policy,
+            _Continuing(problem.learner.policy, self._carried),
             frames_per_batch=problem.num_envs,
             total_frames=-1,
             postproc=lambda data: data.reshape(-1),
@@ -55,14 +59,40 @@ class SingleCollection(Collection):
 
     def __next__(self) -> TensorDict:
         data = next(self._steps)
+        self._carried = data.get(keys.CARRIED, None)
         return data.set(keys.ENV_INDEX, torch.arange(len(data), device="cpu"))
 
     def get_positions(self) -> list[EpisodePosition] | None:
-        """Return the position of each environment; None if one has failed."""
-        return positions_of(self.env)
+        """Return the position of each environment, with what the policy carries to its next step;
+        None if one has failed."""
+        positions = positions_of(self.env)
+        if positions is None or self._carried is None:
+            return positions
+        pairs = zip(positions, self._carried.clone(), strict=True)
+        return [{**position, keys.CARRIED: each.to_dict()} for position, each in pairs]
 
     def close(self) -> None:
         """Close the environments."""
         self._collector.shutdown(close_env=False)
         if not self.env.is_closed:
             self.env.close()
+
+
+class _Continuing(TensorDictModuleBase):
+    """A policy, which gets in its first call what it carried to this step before.
+
+    Args:
+        policy: acts on a root TensorDict [num_envs].
+        carried: entries [num_envs]; None for none.
+    """
+
+    def __init__(self, policy: TensorDictModuleBase, carried: TensorDictBase | None) -> None:
+        super().__init__()
+        self.policy, self._carried = policy, carried
+        self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
+
+    def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
+        if self._carried is not None:
+            tensordict.set(keys.CARRIED, self._carried.to(tensordict.device))
+            self._carried = None
+        return self.policy(tensordict)

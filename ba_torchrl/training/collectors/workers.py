@@ -12,6 +12,7 @@ from tensordict.nn import TensorDictModuleBase
 from torch import Tensor
 from torchrl.envs import EnvBase
 
+from ba_torchrl.algorithms.acting import acting_keys
 from ba_torchrl.core import keys
 from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.envs.faults import MAX_CONSECUTIVE_FAULTS
@@ -40,7 +41,7 @@ class VersionedPolicy(TensorDictModuleBase):
         self.first_env = first_env
         self.register_buffer("version", torch.tensor(NO_WEIGHTS))
         self.in_keys = list(policy.in_keys)
-        self.out_keys = [keys.ACTION, VERSION, keys.ENV_INDEX]
+        self.out_keys = [*acting_keys(policy), VERSION, keys.ENV_INDEX]
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write action, version and numbers of the environments of a root TensorDict [envs]."""
