@@ -1,12 +1,15 @@
 import pytest
 import torch
 from tensordict import TensorDict
-from tensordict.nn import TensorDictModule
+from tensordict.nn import NormalParamExtractor, TensorDictModule
 from torch import nn
+from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.core import keys
-from ba_torchrl.modules.chunks import ChunkFlow, ChunkHead
+from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
+from ba_torchrl.modules.chunks import ChunkFlow, ChunkHead, ChunkPolicy
 from ba_torchrl.objectives.flow import FlowMatchingLoss
+from ba_torchrl.objectives.imitation import BehaviourCloningLoss
 
 T, A = 3, 2
 
@@ -78,26 +81,43 @@ def test_masked_samples_do_not_count():
     torch.testing.assert_close(found, each.sum() - each[2])
 
 
-def test_two_equal_goals_are_both_reached_and_not_their_mean():
-    """Where the data has -0.8 and 0.8, regression gives 0."""
-    flow, loss = make()
-    goal = torch.where(torch.arange(64) % 2 == 0, 0.8, -0.8)[:, None, None].expand(64, T, A)
-    data = TensorDict(
-        {
-            "x": torch.zeros(64, 5),
-            keys.TARGET_CHUNK: goal,
-            keys.TARGET_CHUNK_MASK: torch.ones(64, T, dtype=torch.bool),
-        },
-        [64],
-    )
-    optimizer = torch.optim.Adam(loss.parameters(), 3e-3)
-    for _ in range(300):
+def learned(loss, data, steps=300):
+    """Minimise a loss."""
+    optimizer = torch.optim.Adam(loss.parameters(), 1e-2)
+    for _ in range(steps):
         optimizer.zero_grad()
-        loss(data)["loss_flow"].backward()
+        sum(loss(data).values()).backward()
         optimizer.step()
-    with torch.no_grad():
-        chunks = flow(torch.zeros(200, 5), torch.randn(200, T, A))
-    assert (chunks.abs() - 0.8).abs().mean() < 0.2
-    first = chunks[:, 0, 0] > 0
-    assert 0.3 < first.float().mean() < 0.7
-    assert ((chunks > 0) == first[:, None, None]).float().mean() > 0.95  # one goal in a chunk
+
+
+@torch.no_grad()
+def ends(policy, n=200):
+    """Play a task: goals at -1 and 1 are equally far from the start at 0, and four steps away."""
+    x, carried = torch.zeros(n, 1), TensorDict({}, [n])
+    for step in range(4):
+        state = TensorDict({"x": x, keys.STEP_COUNT: torch.full((n, 1), step)}, [n])
+        out = policy(state.update(carried))
+        x = x + 0.25 * out[keys.ACTION]
+        carried = out.select(keys.CARRIED, strict=False)
+    return x.squeeze(-1)
+
+
+def test_one_of_two_equal_goals_is_reached_where_cloning_stays_between_them():
+    torch.manual_seed(0)
+    side = torch.tensor([-1.0, 1.0]).repeat_interleave(4)[:, None]
+    data = {"x": side * (torch.arange(8) % 4)[:, None] / 4, keys.ACTION: 0.95 * side}
+    data |= {keys.TARGET_CHUNK: (0.95 * side)[:, None].expand(8, 2, 1)}
+    data |= {keys.TARGET_CHUNK_MASK: torch.ones(8, 2, dtype=torch.bool)}
+    data = TensorDict(data, [8]).repeat(8)
+    head = ChunkHead(4, torch.eye(1)[None], torch.zeros(1, 0, 0), 2, hidden=64)
+    chunks = ChunkPolicy(ChunkFlow(nn.Linear(1, 4), head), ["x"], 1, executed=2, seed=0)
+    learned(FlowMatchingLoss(chunks.flow), data)
+    with set_exploration_type(ExplorationType.RANDOM):
+        reached = ends(chunks)
+    assert (reached.abs() > 0.6).float().mean() > 0.85
+    assert 0.3 < (reached > 0).float().mean() < 0.7
+    layers = nn.Sequential(nn.Linear(1, 32), nn.SiLU(), nn.Linear(32, 2), NormalParamExtractor())
+    clone = squashed_gaussian_policy(layers, ["x"])
+    learned(BehaviourCloningLoss(clone), data)
+    with set_exploration_type(ExplorationType.DETERMINISTIC):
+        assert ends(clone).abs().max() < 0.2
