@@ -110,9 +110,9 @@ class EnvConfig(StrictModel):
     expert: bool = False
     """Add the expert's action to every observation."""
     expert_chunk: int = Field(default=0, ge=0, le=100, json_schema_extra=_CLOSE_LOOP)
-    """Close loop: number of the expert's next actions that are added to every observation, with
-    ``expert``. The expert plays them, and the state is restored; steps take as many times longer,
-    and differ in the last bits from those without it."""
+    """Close loop: number of the expert's next actions that are added to every observation. The
+    expert plays them, and the state is restored bit for bit. Steps take that many times longer, and
+    their last bits are those of an environment whose state is saved before each step."""
     seed: int | None = Field(default=None, ge=0)
     """Seed of all episodes; drawn at random if None."""
 
@@ -171,8 +171,6 @@ class EnvConfig(StrictModel):
             raise ValueError(f"{', '.join(custom)} needs physics_mode='custom'")
         if self.physics_mode == "custom" and not custom:
             raise ValueError(f"physics_mode='custom' needs one of {', '.join(CUSTOM_PHYSICS)}")
-        if self.expert_chunk and not self.expert:
-            raise ValueError("expert_chunk needs expert=True")
         usual = EnvConfig.model_fields["reward_discount"].default
         if self.reward != "difference" and self.reward_discount != usual:
             raise ValueError("reward_discount has no effect without reward='difference'")

@@ -505,14 +505,16 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
                 observation[key] = torch.from_numpy(image.astype(np.float32))
         for extra in self._observations:
             observation |= extra.observe(scene)
-        if self.config.expert:
+        horizon = self.config.expert_chunk
+        if self.config.expert or horizon:
             with scene.world.fixed_poses():  # experts read the same poses many times
                 action = self._expert_action(scene)
-            observation[keys.EXPERT_ACTION] = torch.from_numpy(action)
-            if horizon := self.config.expert_chunk:
-                found = expert_chunk(scene, action, horizon, self._act, self._expert_action)
-                for key, value in zip(_CHUNK, found, strict=True):
-                    observation[key] = torch.from_numpy(value)
+            if self.config.expert:
+                observation[keys.EXPERT_ACTION] = torch.from_numpy(action)
+        if horizon:
+            found = expert_chunk(scene, action, horizon, self._act, self._expert_action)
+            for key, value in zip(_CHUNK, found, strict=True):
+                observation[key] = torch.from_numpy(value)
         check_observation(observation)
         return observation
 

@@ -173,9 +173,7 @@ def test_the_experts_chunk_is_what_it_does_next_and_leaves_the_state(make, task)
     assert counts == {1, 2, 3}
 
 
-def test_a_chunk_of_nobody_is_refused():
-    with pytest.raises(ConfigError, match="expert_chunk needs expert=True"):
-        ba_torchrl.make("close_loop/block_picking", expert_chunk=3)
+def test_a_chunk_in_open_loop_is_refused():
     with pytest.raises(ConfigError, match="'expert_chunk' is for close-loop tasks"):
         ba_torchrl.make("open_loop/block_stacking", expert=True, expert_chunk=3)
 
