@@ -18,6 +18,7 @@ from torchrl.envs import Transform
 from torchrl.envs.utils import ExplorationType, exploration_type
 from torchrl.objectives import LossModule
 
+from ba_torchrl.algorithms.acting import acting_keys
 from ba_torchrl.algorithms.base import Learner, Problem, SeedUse
 from ba_torchrl.algorithms.imitation_config import DAggerConfig, ImitationConfig
 from ba_torchrl.algorithms.spatial_actions import demonstration_on_grid, make_spatial_values
@@ -104,7 +105,7 @@ class MixedPolicy(TensorDictModuleBase):
         self.policy = policy
         self.register_buffer("beta", torch.zeros(()))  # among the weights that workers receive
         self.in_keys = list(policy.in_keys)
-        self.out_keys = [keys.ACTION]
+        self.out_keys = acting_keys(policy)
         self._actions = actions
         self.generator = seeded_generator(seed)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import re
 import shlex
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -17,7 +18,8 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from yaml import YAMLError
+from yaml import ScalarEvent, YAMLError
+from yaml import parse as parse_yaml
 
 from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import plain_errors
@@ -28,6 +30,8 @@ from ba_torchrl.record.logging import limit_library_logs
 from ba_torchrl.record.results import flat
 
 LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
+_OTHER_BASE = re.compile(r"[-+]?(0[0-7_]*[1-7][0-7_]*|\d[\d_]*(:[0-5]?\d)+(\.[\d_]*)?)")
+"""Numbers that YAML 1.1 reads with base 8 or 60, such as 064 and 6:40."""
 
 
 @dataclass(frozen=True)
@@ -198,6 +202,13 @@ class Command:
                 return text
         if not text:
             return text
+        for event in parse_yaml(text):
+            is_plain = isinstance(event, ScalarEvent) and event.implicit[0]
+            if is_plain and _OTHER_BASE.fullmatch(event.value):
+                raise ConfigError(
+                    f"{name}: YAML does not read {event.value} as a decimal number; write it "
+                    "without a zero in front and without colons, or in quotes"
+                )
         return OmegaConf.to_container(OmegaConf.from_dotlist([f"value={text}"]))["value"]
 
     def _refuse(self, option: str, words: Sequence[str]) -> NoReturn:

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError, deserialize, safe_open
 
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError
 
@@ -297,16 +297,24 @@ def write_tensors(path: Path, tensors: dict[str, torch.Tensor]) -> None:
         raise OSError(code, os.strerror(code), str(path)) from error
 
 
-def header_texts(path: Path) -> dict[str, str]:
+def header_texts(path: Path, content: bytes | None = None) -> dict[str, str]:
     """Return the texts in the header of a safetensors file, by name; no tensor is read.
+
+    Args:
+        path: of the file.
+        content: of the file, if it has been read: another process may have replaced the file.
 
     Raises:
         DamagedFilesError: it is not such a file, its header is longer than 100 MB, or the file has
             another length than the header says.
     """
     try:
-        with safe_open(path, framework="np") as file:
-            return file.metadata() or {}
+        if content is None:
+            with safe_open(path, framework="np") as file:
+                return file.metadata() or {}
+        deserialize(content)  # checks header and length
+        header = content[8 : 8 + int.from_bytes(content[:8], "little")]
+        return json.loads(header).get("__metadata__") or {}
     except SafetensorError as error:
         raise DamagedFilesError(f"{path} is not a whole safetensors file: {error}") from None
 

@@ -137,8 +137,9 @@ class TransitionLoss(EvalModeTargetsLoss):
             weights = tensordict.get(self.tensor_keys.priority_weight, None)
         if weights is not None:
             weights = weights.reshape(tensordict.batch_size)
-            if self.weight_norm == "max":  # of the samples that a mask leaves
-                weights = weights / self._reduce_loss(weights, tensordict, reduction="none").amax()
+            if self.weight_norm == "max":  # of the samples that a mask leaves, if there are any
+                weights = self._reduce_loss(weights, tensordict, reduction="none")
+                weights = weights / _positive(weights.amax())
         choices = get_args(WeightedTerms)
         last = choices.index(self.weighted_terms)
         return {term: weights if number <= last else None for number, term in enumerate(choices)}
@@ -169,9 +170,21 @@ class TransitionLoss(EvalModeTargetsLoss):
             losses = torch.where(chosen, losses, 0.0)
             if reduction == "mean":
                 counted = chosen | ~chosen.any()  # all zeros if there are none, not 0 / 0
-        return self._reduce_loss(
-            losses, tensordict, mask=counted, reduction=reduction, weights=weights
+        if weights is None or reduction != "mean":
+            return self._reduce_loss(
+                losses, tensordict, mask=counted, reduction=reduction, weights=weights
+            )
+        # as TorchRL's mean, which is 0 / 0 if every sample is masked or has no weight
+        total, sum_of_weights = (
+            self._reduce_loss(values, tensordict, mask=counted, reduction="sum", weights=factors)
+            for values, factors in ((losses, weights), (weights, None))
         )
+        return total / _positive(sum_of_weights)
+
+
+def _positive(value: Tensor) -> Tensor:
+    """Return a divisor that is not negative with the least positive number in place of 0."""
+    return value.clamp_min(torch.finfo(value.dtype).tiny)
 
 
 def _next(key: NestedKey) -> tuple[str, ...]:

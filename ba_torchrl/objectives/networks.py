@@ -81,7 +81,8 @@ class EvalModeTargetsLoss(LossModule):
         Args:
             written: keys of entries that `forward` writes into its input.
         """
-        samples, shape = tensordict.reshape(-1), tensordict.batch_size
+        shape = tensordict.batch_size
+        samples = tensordict.reshape(shape.numel())
         out = self.forward(samples)
         for key in written:
             tensordict.set(key, samples[key].reshape(*shape, *samples[key].shape[1:]))

@@ -208,6 +208,14 @@ class RunResult(StrictModel):
             raise ValueError(f"without the version of {' and '.join(missing)}")
         return versions
 
+    @field_validator("config")
+    @classmethod
+    def _check_task(cls, config: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
+        task = info.data.get("task")
+        if config.get("task", task) != task:
+            raise ValueError(f"its task, {config['task']!r}, is not that of the result")
+        return config
+
     @field_validator("files")
     @classmethod
     def _check_files(cls, files: dict[str, str]) -> dict[str, str]:
@@ -237,11 +245,12 @@ def write_result(folder: str | Path, result: RunResult) -> Path:
     return write_text(Path(folder) / RESULT_FILE, result.model_dump_json(indent=2) + "\n")
 
 
-def read_result(path: str | Path) -> RunResult:
+def read_result(path: str | Path, content: bytes | None = None) -> RunResult:
     """Read a result, which somebody else may have written, without the weights of a policy.
 
     Args:
         path: a run folder, its ``result.json``, or the ``.safetensors`` file of a policy.
+        content: of a policy's file, if it has been read.
 
     Raises:
         ConfigError: the file cannot be read, or holds no result.
@@ -249,7 +258,8 @@ def read_result(path: str | Path) -> RunResult:
     path = Path(path)
     file = path / RESULT_FILE if path.is_dir() else path
     try:
-        text: str | bytes = json_bytes(file) if file.suffix != POLICY_SUFFIX else _in_header(file)
+        is_policy = file.suffix == POLICY_SUFFIX
+        text: str | bytes = _in_header(file, content) if is_policy else json_bytes(file)
         return RunResult.model_validate_json(text)
     except OSError as error:
         raise ConfigError(f"cannot read {file}: {error.strerror or error}") from None
@@ -260,9 +270,9 @@ def read_result(path: str | Path) -> RunResult:
         raise ConfigError(f"{file} has no valid result: {reason}") from None
 
 
-def _in_header(file: Path) -> str:
+def _in_header(file: Path, content: bytes | None) -> str:
     """Return the text of the result in a policy's file."""
-    texts = header_texts(file)
+    texts = header_texts(file, content)
     if POLICY_RESULT not in texts:
         raise ConfigError(
             f"{file} holds no result; `ba-torchrl export` writes a policy with that of its test"

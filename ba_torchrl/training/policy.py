@@ -259,7 +259,7 @@ def load_policy(
         if not path.exists():
             hint = f"; and there is no run folder and no file of a policy {source}"
             raise UnknownNameError("policy", str(source), shipped_policies(), hint)
-    if path.suffix != POLICY_SUFFIX:
+    if path.suffix != POLICY_SUFFIX or path.is_dir():
         checkpoint = find_checkpoint(path, which)
         config, learner = load(checkpoint, **changes)
         versions = read_versions(checkpoint.parent.parent)
@@ -267,9 +267,9 @@ def load_policy(
         return TrainedPolicy(learner, config, learner.updates, checkpoint, versions)
     try:
         data = path.read_bytes()
-        result = read_result(path) if POLICY_RESULT in header_texts(path) else None
     except OSError as error:
         raise ConfigError(f"cannot read {path}: {error.strerror}") from None
+    result = read_result(path, data) if POLICY_RESULT in header_texts(path, data) else None
     known = result or _read_card(path)
     if known.policy_file != (_digest(data) if result else sha256(data).hexdigest()):
         raise DamagedFilesError(f"{path} was altered: it does not have the weights of its result")

@@ -92,7 +92,7 @@ def register() -> None:
     )
     OmegaConf.register_new_resolver("method", method_name, replace=True)
     OmegaConf.register_new_resolver(
-        "file_name", lambda text: text.replace("/", "_").replace(" ", "_"), replace=True
+        "file_name", lambda text: str(text).replace("/", "_").replace(" ", "_"), replace=True
     )
     for group, registry in GROUPS.items():
         for name in registry.plugin_names():

@@ -13,11 +13,13 @@ from torchrl.envs import SerialEnv
 
 import ba_torchrl
 from ba_torchrl.algorithms.acting import ActingPolicy
+from ba_torchrl.algorithms.imitation import MixedPolicy
 from ba_torchrl.core import keys
 from ba_torchrl.demonstrations.episodes import collect_episodes
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import versions_of
 from ba_torchrl.training import protocol
+from ba_torchrl.training.collectors.workers import VersionedPolicy
 from ba_torchrl.training.evaluation import acting_on, record_episodes
 from ba_torchrl.training.policy import TrainedPolicy
 
@@ -69,9 +71,13 @@ def test_collected_episodes_keep_them(policy):
     env.close()
 
 
-def test_a_trained_policy_passes_them_on(policy):
+@pytest.mark.parametrize(
+    "wrapped",
+    [lambda policy: ActingPolicy(policy, []), lambda policy: MixedPolicy(policy, None, 0)],
+)
+def test_a_trained_policy_passes_them_on(policy, wrapped):
     resolved = resolve_env(TASK, SMALL)
-    learner = SimpleNamespace(policy=ActingPolicy(policy, []), images={}, vectors={})
+    learner = SimpleNamespace(policy=wrapped(policy), images={}, vectors={})
     config = SimpleNamespace(task=TASK, resolved_env=resolved)
     trained = TrainedPolicy(learner, config, 0, Path("runs"), versions_of(TASK))
     env = ba_torchrl.make(resolved)
@@ -83,7 +89,10 @@ def test_recorded_episodes_keep_them(policy):
     record_episodes(resolve_env(TASK, SMALL), policy, 2, seed=0)
 
 
-def test_torchrls_rollouts_and_collectors_keep_them(policy):
+@pytest.mark.parametrize("wrapped", [lambda policy: policy, VersionedPolicy])
+def test_torchrls_rollouts_and_collectors_keep_them(policy, wrapped):
+    policy = wrapped(policy)
+    assert COUNT in policy.out_keys
     env = ba_torchrl.make(TASK, **SMALL)
     assert env.rollout(5, policy)[COUNT].flatten().tolist() == list(range(5))
     vector = SerialEnv(2, lambda: ba_torchrl.make(TASK, **SMALL))

@@ -8,7 +8,13 @@ import pytest
 import torch
 
 from ba_torchrl.modules.steerable.kernels import he_scales, kernel_block
-from ba_torchrl.modules.steerable.layers import SteerableConv2d, SteerableLinear, reuse_filters
+from ba_torchrl.modules.steerable.layers import (
+    DynamicSteerableConv2d,
+    FilterGenerator,
+    SteerableConv2d,
+    SteerableLinear,
+    reuse_filters,
+)
 from ba_torchrl.modules.steerable.planar import planar_rotations
 
 
@@ -99,11 +105,18 @@ def test_forward_and_he_scales_equal_escnn(case):
     torch.testing.assert_close(actual, expected)
 
 
-def test_initial_coefficients_have_the_he_scale():
+@pytest.mark.parametrize("device", ["cpu", "meta"])
+def test_initial_coefficients_have_the_he_scale(device):
     torch.manual_seed(0)
     group = planar_rotations(8)
     types = [(group.regular_repr, 32)]
-    layer = SteerableConv2d(types, types, 3)
+    with torch.device(device):
+        layer = SteerableConv2d(types, types, 3)
+        generator = FilterGenerator(4, DynamicSteerableConv2d(group.regular_repr, 2, 3))
+    if device == "meta":  # torch's way to draw the parameters later
+        for each in (layer, generator):
+            each.to_empty(device="cpu").reset_parameters()
+    assert all(each.isfinite().all() and each.any() for each in generator.parameters())
     (scale,) = he_scales(layer._blocks, types, types).values()
     measured = layer.coefficients["in0_out0"].detach().flatten(0, 1).std(dim=0)
     torch.testing.assert_close(measured, scale, rtol=0.15, atol=0)

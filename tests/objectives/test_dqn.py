@@ -246,6 +246,19 @@ def test_masked_samples_do_not_count(kind, norm):
     torch.testing.assert_close(dict(found), dict(expected))
 
 
+@pytest.mark.parametrize("norm", ["max", "mean"])
+def test_without_samples_that_count_loss_and_gradient_are_zero(norm):
+    loss = make_loss(demonstrations="sdqfd", weighted_terms="all", weight_norm=norm)
+    data = batch()
+    data["priority_weight"] = torch.linspace(0, 1, 10)
+    for none in (data[:1], data.set(("collector", "mask"), torch.zeros(10, 1).bool())):
+        losses = loss(none)
+        total = losses["loss_qvalue"] + losses["loss_demonstration"]
+        total.backward()
+        assert total == 0
+        assert not any(value.grad.any() for value in loss.parameters() if value.grad is not None)
+
+
 @pytest.mark.parametrize("action_space", ["one_hot", "categorical"])
 def test_a_q_value_actor_of_torchrl_is_one_level(action_space):
     network, actor, data, index = q_value_actor(action_space)

@@ -7,6 +7,7 @@ import shutil
 import sys
 from contextlib import closing
 from hashlib import sha256
+from pathlib import Path
 
 import pytest
 import torch
@@ -278,6 +279,8 @@ def test_what_is_no_policy_is_named(run, tmp_path):
         loaded(config={**saved["config"], "new": 1})
     with pytest.raises(ConfigError, match=r"p.safetensors has no valid result: format"):
         loaded(format=1)
+    with pytest.raises(ConfigError, match=r"no valid result: config: its task, 'close_loop/"):
+        loaded(task="open_loop/block_stacking")
     wider = {**saved["config"]["network"], "width": 2 * saved["config"]["network"]["width"]}
     with pytest.raises(ConfigError, match="does not hold the policy of its result"):
         loaded(config={**saved["config"], "network": wider})
@@ -290,6 +293,26 @@ def test_what_is_no_policy_is_named(run, tmp_path):
         path.write_bytes(altered)
         with pytest.raises(ConfigError, match=reason):
             ba_torchrl.load_policy(path)
+
+
+def test_a_file_that_is_replaced_while_it_is_read_is_one_of_the_two(tmp_path, monkeypatch):
+    path, read = tmp_path / "p.safetensors", Path.read_bytes
+    tasks = ["close_loop/block_picking", "close_loop/block_pushing"]
+    first, second = (read(policies.shipped_file(task)) for task in tasks)
+    path.write_bytes(first)
+
+    def replaced_after(file):
+        content = read(file)
+        path.write_bytes(second)
+        return content
+
+    monkeypatch.setattr(Path, "read_bytes", replaced_after)
+    assert ba_torchrl.load_policy(path).task == tasks[0]
+
+
+def test_a_run_folder_may_have_the_ending_of_a_policy(run, tmp_path):
+    (tmp_path / "a.safetensors").symlink_to(run)
+    assert ba_torchrl.load_policy(tmp_path / "a.safetensors").updates
 
 
 def test_an_export_that_stops_leaves_the_policy_before(run, tmp_path, monkeypatch):

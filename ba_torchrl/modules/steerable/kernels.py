@@ -108,7 +108,8 @@ def he_scales(
             [
                 1 / math.sqrt(len(sources[o, target]) * kernels[source, o, target])
                 for source, target in zip(block.in_irreps, block.out_irreps, strict=True)
-            ]
+            ],
+            device="cpu",  # with values, where the layer is made on the meta device
         )
         for (i, o), block in blocks.items()
     }

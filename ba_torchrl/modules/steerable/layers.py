@@ -272,7 +272,7 @@ class DynamicSteerableConv2d(nn.Module):
     def scales(self) -> Tensor:
         """Return the standard deviation that He initialisation gives each coefficient."""
         weights = self._scales.repeat(self.count * self.count)
-        return torch.cat([weights, torch.zeros(self.num_biases)])
+        return torch.cat([weights, torch.zeros(self.num_biases, device=weights.device)])
 
     def filters(self, coefficients: Tensor) -> tuple[Tensor, Tensor]:
         """Return the filters [B, out, in, K, K] and biases [B, out] of coefficients [B, n]."""
