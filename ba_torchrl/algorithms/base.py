@@ -229,6 +229,11 @@ class Learner(ABC):
         by default it can choose all. Demonstrations execute what is learnt: these actions."""
         return action
 
+    @property
+    def equal_moves(self) -> int:
+        """Number of actions any of which is imitated; by default 0, for one action alone."""
+        return 0
+
     def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
         """Return steps of any batch shape as the transitions [N] that the replay stores."""
         return as_transitions(
@@ -237,6 +242,7 @@ class Learner(ABC):
             self.vectors,
             is_demonstration=is_demonstration,
             imitates=self.config.imitates,
+            equal_moves=self.equal_moves,
         )
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:

@@ -36,6 +36,11 @@ class BC(Learner):
     config: ImitationConfig
 
     @property
+    def equal_moves(self) -> int:
+        """Number of actions any of which is imitated; 0 for the expert's own alone."""
+        return self.problem.equal_moves if self.config.equal_moves else 0
+
+    @property
     def actions(self) -> SpatialActions | None:
         """The grid of actions of an open-loop policy; None in close loop."""
         is_grid = self.problem.control == "open_loop"
@@ -56,12 +61,12 @@ class BC(Learner):
 
     def make_loss(self, networks: nn.Module) -> LossModule:
         """Return the divergence of sampled actions from the expert's, with gradients at the ends of
-        the range, or the cross-entropy of every level's values with the expert's choice."""
+        the range, or the cross-entropy of every level's values with the expert's choices."""
         if self.problem.control == "close_loop":
             loss = BehaviourCloningLoss(self.make_policy(networks), "kl")
         else:
-            loss = LevelCrossEntropyLoss(networks)
-        loss.set_keys(action=keys.TARGET_ACTION)
+            loss = LevelCrossEntropyLoss(networks, of_sets=self.equal_moves > 0)
+        loss.set_keys(action=keys.TARGET_MOVES if self.equal_moves else keys.TARGET_ACTION)
         return loss
 
     def make_transforms(self, networks: nn.Module) -> list[Transform]:

@@ -27,6 +27,9 @@ class ImitationConfig(LearnerConfig):
     rotation: AnyRotation = NoRotation()
     """Of sampled transitions: about the z axis in close loop, rigid transforms in open loop."""
     replay: Uniform = Uniform()
+    equal_moves: bool = True
+    """Whether any of the moves that the expert holds for equal is imitated, in tasks whose expert
+    gives them, instead of its own alone."""
 
     def check(self, network: NetworkConfig, control: Control) -> None:
         """As for `LearnerConfig`; a rotation of the other control is refused too."""

@@ -33,6 +33,8 @@ class Problem:
     """Length of each vector that the environment observes, by key."""
     center_m: tuple[float, float] = (0.0, 0.0)
     """x and y of the workspace's centre."""
+    equal_moves: int = 0
+    """Number of actions in the expert's sets of equal moves; 0 if it gives none."""
 
     def derived_seed(self, use: SeedUse) -> int:
         """Return the run's seed for one use of randomness."""

@@ -43,8 +43,9 @@ def demonstration_on_grid(
     """
     action = episode[keys.ACTION]
     out = episode.copy().set(keys.ACTION, grid.nearest(action))
-    if keys.EXPERT_ACTION in episode:
-        out.set(keys.EXPERT_ACTION, grid.nearest(episode[keys.EXPERT_ACTION]))
+    for key in (keys.EXPERT_ACTION, keys.EXPERT_MOVES):
+        if key in episode:
+            out.set(key, grid.nearest(episode[key]))
     is_swapped = grid.swaps_fingers(action)
     is_over = torch.zeros(len(episode) + 1, dtype=torch.bool, device="cpu")
     for t, is_holding in enumerate(episode[keys.HOLDING].flatten().tolist()):

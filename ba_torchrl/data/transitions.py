@@ -23,6 +23,7 @@ def as_transitions(
     *,
     is_demonstration: bool,
     imitates: Imitation = "executed",
+    equal_moves: int = 0,
 ) -> TensorDict:
     """Return the transitions [N] of a rollout with the entries that the replay stores.
 
@@ -32,6 +33,9 @@ def as_transitions(
         vectors: keys of the vectors to store.
         is_demonstration: whether they are those of demonstrations.
         imitates: the imitated action, stored as ``target_action`` if it is not the executed one.
+        equal_moves: number K of actions [K, A] that are stored as ``target_moves`` beside it, any
+            of which is imitated: the expert's equal moves or, where they are not known, the
+            imitated action K times. 0 for none.
 
     Raises:
         KeyError: an entry is missing.
@@ -45,7 +49,14 @@ def as_transitions(
     if imitates in WITH_TARGET:
         is_needed = imitates == "expert_everywhere" and not is_demonstration
         has_expert = is_needed or keys.EXPERT_ACTION in flat
-        out[keys.TARGET_ACTION] = flat[keys.EXPERT_ACTION if has_expert else keys.ACTION].clone()
+        target = flat[keys.EXPERT_ACTION if has_expert else keys.ACTION].clone()
+        out[keys.TARGET_ACTION] = target
+        if equal_moves:
+            moves = target[:, None].expand(-1, equal_moves, -1)
+            known = flat.get(keys.EXPERT_MOVES, None)
+            if known is not None and known.shape == moves.shape:  # not of another version's size
+                moves = known
+            out[keys.TARGET_MOVES] = moves.clone()
     else:
         has_expert = False
     if is_demonstration and imitates != "none" and not has_expert and keys.IS_EXPERT in flat:

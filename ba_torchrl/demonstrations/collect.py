@@ -63,9 +63,10 @@ def collect_demonstrations(
         on_episode: called with each episode that is played when it ends, for progress bars.
 
     Returns:
-        Episodes as TensorDicts [T], with the entries of an environment without ``expert``. With
-        noise of either kind, ``is_expert`` [T, 1] tells which executed actions are the expert's,
-        and ``expert_action`` [T, A] is the expert's in every state.
+        Episodes as TensorDicts [T], with the entries of an environment without ``expert``, and with
+        ``expert_moves`` [T, K, A] of tasks whose expert gives equal moves. With noise of either
+        kind, ``is_expert`` [T, 1] tells which executed actions are the expert's, and
+        ``expert_action`` [T, A] is the expert's in every state.
 
     Raises:
         ConfigError: the source is unknown or cannot have noise, the noise is no probability, the
@@ -91,8 +92,9 @@ def collect_demonstrations(
         if add_noise is not None:
             out = add_noise(out)
         if nearest_action is not None:
-            for key in (keys.ACTION, keys.EXPERT_ACTION):
-                out.set(key, nearest_action(out[key]))
+            for key in (keys.ACTION, keys.EXPERT_ACTION, keys.EXPERT_MOVES):
+                if key in out:
+                    out.set(key, nearest_action(out[key]))
         return out
 
     keep = is_success if only_successful else None
@@ -102,8 +104,7 @@ def collect_demonstrations(
     if source == "deconstruction":
         return [reverse_episode(episode) for episode in played]
     same_action = () if add_noise is not None else (keys.EXPERT_ACTION,)
-    of_next = (keys.EXPERT_ACTION, keys.EXPERT_CHUNK, keys.EXPERT_CHUNK_MASK)
-    others = (*same_action, *((keys.NEXT, key) for key in of_next))
+    others = (*same_action, *((keys.NEXT, key) for key in keys.OF_EXPERT))
     return [episode.exclude(*others) for episode in played]
 
 

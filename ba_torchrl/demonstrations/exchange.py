@@ -48,6 +48,8 @@ logger = logging.getLogger(__name__)
 
 _COUNTED = {*keys.STEP_FLAGS, keys.STEP_COUNT}
 """Entries of a state that follow from the results of the steps before it."""
+_OWN = {keys.EXPERT_MOVES}
+"""Entries that no other library has."""
 _MOST_INSTRUCTIONS = 20
 
 
@@ -250,7 +252,7 @@ def _roles(episode: TensorDictBase) -> dict[str, Any]:
     following = set(episode[keys.NEXT].keys())
     roles: dict[str, Any] = {
         key: "observation" if key in following else "action"
-        for key in sorted(set(episode.keys()) - _COUNTED - {keys.NEXT})
+        for key in sorted(set(episode.keys()) - _COUNTED - _OWN - {keys.NEXT})
     }
     return roles | dict.fromkeys(RESULTS, "result")
 

@@ -34,8 +34,7 @@ from ba_torchrl.envs.settings import ResolvedEnv
 
 logger = logging.getLogger(__name__)
 
-_OF_EXPERT = {keys.EXPERT_ACTION, keys.EXPERT_CHUNK, keys.EXPERT_CHUNK_MASK}
-_NOT_OBSERVED = {*keys.STEP_FLAGS, keys.STEP_COUNT, *_OF_EXPERT, keys.INSTRUCTION}
+_NOT_OBSERVED = {*keys.STEP_FLAGS, keys.STEP_COUNT, *keys.OF_EXPERT, keys.INSTRUCTION}
 _ONE_PER_ACTION = {keys.ACTION, *RESULTS}
 _RESULT = Unbounded((1,), device="cpu", dtype=torch.float64)
 _TOLERANCE = 1e-4

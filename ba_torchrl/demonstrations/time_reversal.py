@@ -39,7 +39,7 @@ UNDO_IN_HAND = "undo_in_hand"
 """Key, like ``in_hand``: the in-hand image after the inverse action, if that is a pick."""
 CAN_UNDO = "can_undo"
 """Key, [1] bool: the last action has an inverse, since it moved exactly one object."""
-_EXTRA = (UNDO_ACTION, UNDO_IN_HAND, CAN_UNDO, keys.EXPERT_ACTION)
+_EXTRA = (UNDO_ACTION, UNDO_IN_HAND, CAN_UNDO, *keys.OF_EXPERT)
 
 
 class DeconstructionEnv(OpenLoopEnv):

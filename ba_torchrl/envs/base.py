@@ -194,6 +194,14 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     def _expert_action(self, scene: Scene) -> np.ndarray:
         """Return the expert's action."""
 
+    def _expert_specs(self, action: Bounded) -> dict[str, Bounded]:
+        """Return the specifications of the entries of `_expert_entries`, from that of actions."""
+        return {keys.EXPERT_ACTION: action.clone()}
+
+    def _expert_entries(self, scene: Scene) -> dict[str, np.ndarray]:
+        """Return what the observation tells of the expert, by key."""
+        return {keys.EXPERT_ACTION: self._expert_action(scene)}
+
     def _rendered_world(self, scene: Scene) -> World:
         """Return the world that `render` shows."""
         return scene.world
@@ -443,7 +451,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         general = {key: flag() for key in (keys.HOLDING, keys.SUCCESS, keys.FAULT)}
         general[keys.STEP_COUNT] = Unbounded((1,), device="cpu", dtype=torch.int64)
         if self.config.expert:
-            general[keys.EXPERT_ACTION] = action.clone()
+            general |= self._expert_specs(action)
         if horizon := self.config.expert_chunk:
             general[keys.EXPERT_CHUNK] = action.expand(horizon, *action.shape).clone()
             general[keys.EXPERT_CHUNK_MASK] = Binary(horizon, device="cpu", dtype=torch.bool)
@@ -508,10 +516,11 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         horizon = self.config.expert_chunk
         if self.config.expert or horizon:
             with scene.world.fixed_poses():  # experts read the same poses many times
-                action = self._expert_action(scene)
+                entries = self._expert_entries(scene)
             if self.config.expert:
-                observation[keys.EXPERT_ACTION] = torch.from_numpy(action)
+                observation |= {key: torch.from_numpy(value) for key, value in entries.items()}
         if horizon:
+            action = entries[keys.EXPERT_ACTION]
             found = expert_chunk(scene, action, horizon, self._act, self._expert_action)
             for key, value in zip(_CHUNK, found, strict=True):
                 observation[key] = torch.from_numpy(value)

@@ -28,9 +28,7 @@ INFO_KEYS = (
     keys.SUCCESS,
     keys.FAULT,
     keys.STEP_COUNT,
-    keys.EXPERT_ACTION,
-    keys.EXPERT_CHUNK,
-    keys.EXPERT_CHUNK_MASK,
+    *keys.OF_EXPERT,
     keys.INSTRUCTION,
 )
 """Entries that are in ``info`` and not in the observation."""
@@ -40,10 +38,11 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     """A task as a Gymnasium environment with a dictionary of observations.
 
     ``info`` holds ``success``, ``fault``, ``step_count``, the conditions of success and, with
-    ``expert=True``, ``expert_action``; ``is_success`` is ``success`` under the name that
-    Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that the arm cannot execute;
-    ``instruction`` is the goal as a sentence, with ``observations=["instruction"]``. Flags are
-    arrays of one bool without axes, which vectors of environments stack to arrays of bools.
+    ``expert=True``, ``expert_action`` and, of some tasks, ``expert_moves``; ``is_success`` is
+    ``success`` under the name that Stable-Baselines3 logs; ``is_out_of_reach`` tells an action that
+    the arm cannot execute; ``instruction`` is the goal as a sentence, with
+    ``observations=["instruction"]``. Flags are arrays of one bool without axes, which vectors of
+    environments stack to arrays of bools.
 
     Args:
         task: as listed by `ba_torchrl.list_tasks`.
@@ -158,7 +157,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         # stack arrays and Python's bools, not NumPy's
         arrays = {key: np.asarray(value) for key, value in values.items()}
         info = {key: a if a.dtype == bool else a[()] for key, a in arrays.items()}
-        for key in (keys.EXPERT_ACTION, keys.EXPERT_CHUNK, keys.EXPERT_CHUNK_MASK):
+        for key in keys.OF_EXPERT:
             if key in state:
                 info[key] = state[key].numpy()
         return observation, info

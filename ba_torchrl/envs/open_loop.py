@@ -166,6 +166,22 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
     def _expert_action(self, scene: Scene) -> np.ndarray:
         return self.actions.encode(scene.task.expert_command())
 
+    def _expert_specs(self, action: Bounded) -> dict[str, Bounded]:
+        """Return the specifications of the expert's action and, if it gives some, equal moves."""
+        specs = super()._expert_specs(action)
+        if count := self.task_class.equal_moves:
+            specs[keys.EXPERT_MOVES] = action.expand(count, self.actions.size).clone()
+        return specs
+
+    def _expert_entries(self, scene: Scene) -> dict[str, np.ndarray]:
+        """Return the expert's action and, if it gives some, the moves that are as good."""
+        count = self.task_class.equal_moves
+        if not count:
+            return super()._expert_entries(scene)
+        moves = [self.actions.encode(move) for move in scene.task.expert_moves()[:count]]
+        moves += moves[:1] * (count - len(moves))
+        return {keys.EXPERT_ACTION: moves[0].copy(), keys.EXPERT_MOVES: np.stack(moves)}
+
     def _rendered_world(self, scene: Scene) -> World:
         """Return the world of a scene; between actions, one with the arm above the workspace."""
         if math.dist(scene.robot.joints, scene.robot.home_joints) > HOME_TOLERANCE_RAD:

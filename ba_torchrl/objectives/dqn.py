@@ -35,6 +35,15 @@ class LevelValues(Protocol):
         """
         ...
 
+    def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the values [B, N] of each level, and which choices are those of one of K actions,
+        bool [B, N]; only losses of sets of actions ask.
+
+        The values of a level, and the actions that count there, are those after the choice of the
+        greatest value among the actions at each level before.
+        """
+        ...
+
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return the greedy choices [B, n], level after level, and the last one's value [B, 1]."""
         ...
@@ -91,6 +100,13 @@ class SingleLevelValues(nn.Module):
         *observation, action = observation_and_action
         chosen = action.long().argmax(dim=-1) if self.is_one_hot else action.reshape(len(action))
         return [(self._action_values(observation), chosen.long())]
+
+    def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the values of all actions [B, N], and which are among some, bool [B, N]."""
+        *observation, moves = observation_and_moves
+        chosen = moves.long().argmax(dim=-1) if self.is_one_hot else moves.flatten(1).long()
+        values = self._action_values(observation)
+        return [(values, torch.zeros_like(values).scatter_(1, chosen, 1.0) > 0)]
 
     def _action_values(self, observation: list[Tensor] | tuple[Tensor, ...]) -> Tensor:
         data = TensorDict({}, [len(observation[0])])

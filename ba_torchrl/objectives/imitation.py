@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass
 
@@ -140,11 +141,23 @@ class LevelCrossEntropyLoss(ImitationLoss):
     The cross-entropy of the softmax of each level's values with the expert's choice, conditioned on
     the expert's choices at the levels before, averaged over the batch and summed over the levels.
 
+    With sets of actions S any of which may be chosen, it is the negative logarithm of the summed
+    probability of their choices C at each level::
+
+        -log sum_{c in C} p(c) = logsumexp(q) - logsumexp(q restricted to C)
+
+    A later level is conditioned on the choice in C that the policy prefers, and the actions of S
+    without that choice do not count there. It is the likelihood of "the action is in S" (Jin and
+    Ghahramani, 2002): zero as soon as all probability is in S, wherever that is. A target that is
+    spread evenly over S would ask for equal probabilities within S, which no image determines.
+
     Args:
         value_network: computes the values of the levels, see
             `ba_torchrl.objectives.dqn.LevelValues`. TorchRL's `QValueActor` is used as a single
             level, see `SingleLevelValues`.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
+        of_sets: whether the entry ``action`` has K actions of each sample, some of them perhaps
+            repeated, in a dimension before that of an action's components.
 
     Examples:
         >>> import torch
@@ -154,6 +167,9 @@ class LevelCrossEntropyLoss(ImitationLoss):
         >>> loss = LevelCrossEntropyLoss(actor)
         >>> loss_bc, accuracy = loss(observation=torch.rand(8, 3), action=torch.randint(5, (8,)))
         >>> loss_bc.backward()
+        >>> loss = LevelCrossEntropyLoss(actor, of_sets=True)
+        >>> equal = torch.tensor([[0, 3]]).expand(8, 2)  # either will do
+        >>> loss_bc, accuracy = loss(observation=torch.rand(8, 3), action=equal)
     """
 
     value_network: nn.Module
@@ -163,9 +179,14 @@ class LevelCrossEntropyLoss(ImitationLoss):
     out_keys = ("loss_bc", "accuracy")
 
     def __init__(
-        self, value_network: LevelValues | QValueActor, reduction: Reduction | None = None
+        self,
+        value_network: LevelValues | QValueActor,
+        reduction: Reduction | None = None,
+        *,
+        of_sets: bool = False,
     ) -> None:
         super().__init__(reduction)
+        self.of_sets = of_sets
         value_network = as_levels(value_network)
         self.convert_to_functional(value_network, "value_network")
         self._set_observation(value_network.in_keys)
@@ -175,14 +196,33 @@ class LevelCrossEntropyLoss(ImitationLoss):
         """Return ``loss_bc`` of observations and expert actions [...], and the fraction of choices
         that are the expert's as ``accuracy``."""
         action = tensordict[self.tensor_keys.action]
-        self._set_batch_size(tensordict, action.ndim - self.value_network.action_dims)
+        own_dims = self.value_network.action_dims + self.of_sets
+        self._set_batch_size(tensordict, action.ndim - own_dims)
         if tensordict.ndim != 1:
             return self._of_one_dimension(tensordict)
         network = self.network("value_network")
         with self.value_network_params.to_module(network, preserve_module_state=False):
-            levels = network(*(tensordict[key] for key in self.in_keys))
-        losses = [F.cross_entropy(*level, reduction="none") for level in levels]
-        hits = [(values.argmax(dim=1) == chosen).float() for values, chosen in levels]
+            values_of = network.of_moves if self.of_sets else network
+            levels = values_of(*(tensordict[key] for key in self.in_keys))
+        if self.of_sets:
+            losses = [set_cross_entropy(*level) for level in levels]
+            hits = [
+                chosen.gather(1, values.argmax(dim=1, keepdim=True))[:, 0].float()
+                for values, chosen in levels
+            ]
+        else:
+            losses = [F.cross_entropy(*level, reduction="none") for level in levels]
+            hits = [(values.argmax(dim=1) == chosen).float() for values, chosen in levels]
         losses = torch.stack([self._reduce_loss(each, tensordict) for each in losses])
         hits = [self._reduce_loss(each, tensordict, reduction="mean") for each in hits]
         return TensorDict({"loss_bc": losses.sum(dim=0), "accuracy": torch.stack(hits).mean()})
+
+
+def set_cross_entropy(values: Tensor, chosen: Tensor) -> Tensor:
+    """Return the negative logarithms of the summed probabilities of choices [B].
+
+    Args:
+        values: of all choices, whose softmax is the policy [B, N].
+        chosen: which choices count, at least one of them, bool [B, N].
+    """
+    return values.logsumexp(dim=1) - values.masked_fill(~chosen, -math.inf).logsumexp(dim=1)

@@ -311,6 +311,15 @@ class OpenLoopTask(Task):
     scale_limits = (0.55, 1.1)
     finger_opening: ClassVar[float] = 1.0
     """Opening of the gripper before a pick, 0 to 1."""
+    equal_moves: ClassVar[int] = 0
+    """Largest number of commands of `expert_moves`; 0 if the expert gives its own alone."""
+
+    def expert_moves(self) -> Sequence[PickPlaceCommand]:
+        """Return commands as good as that of `expert_command`, which is the first of them.
+
+        With `equal_moves`, a policy is trained to choose any of them.
+        """
+        return [self.expert_command()]
 
     def lowest_tool_m(self, xy: tuple[float, float], rotation: Matrix | None = None) -> float:
         """Return the least height of the tool, metres, at which fingers close above the ground."""

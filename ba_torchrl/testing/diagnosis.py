@@ -21,7 +21,7 @@ from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.carried import state_after
 from ba_torchrl.envs.policies import Policy, expert_policy
-from ba_torchrl.testing.labels import OPENING, Offset, label_jumps, offset_of
+from ba_torchrl.testing.labels import OPENING, Offset, label_jumps, nearest_offset, offset_of
 from ba_torchrl.testing.progress import Disturbed, SceneView
 
 Rounding = Callable[[torch.Tensor], torch.Tensor]
@@ -88,7 +88,7 @@ class StateRow:
     step: int
     stage: str
     policy: Offset
-    """Of the policy's action from the expert's."""
+    """Of the policy's action from the expert's, or from the nearest move that is as good."""
     rounded: Offset | None
     """Of the expert's action on the policy's grid from the exact one; None without a grid."""
     jumps: bool
@@ -241,7 +241,7 @@ class _Examiner:
             jumps = label_jumps(env, played.saved[-1], self.rng)
             acted = self.policy(state.clone())
             action, label = acted[keys.ACTION], state[keys.EXPERT_ACTION]
-            policy, rounded = self._offsets(action, label)
+            policy, rounded = self._offsets(action, state)
             name = self._stage_name(bool(state[keys.HOLDING]))
             row = StateRow(seed, len(played.actions), name, policy, rounded, jumps)
             played.rows.append(row)
@@ -273,7 +273,7 @@ class _Examiner:
         else:  # the episode ended in its failing state
             action = self.policy(state.clone())[keys.ACTION]
         jumps = label_jumps(self.env, saved, self.rng)
-        policy, rounded = self._offsets(action, label)
+        policy, rounded = self._offsets(action, state)
         picture = self._picture(action, label)
         after = self._step(saved, action)
         is_solved_after = bool(after[keys.SUCCESS])
@@ -353,13 +353,15 @@ class _Examiner:
 
     # -- what it is --------------------------------------------------------------------------
 
-    def _offsets(self, action: torch.Tensor, label: torch.Tensor) -> tuple[Offset, Offset | None]:
-        """Return the offsets of the policy's action and of the rounded label from the label."""
-        actions, exact = self.env.actions, label.numpy()
-        policy = offset_of(actions, action.numpy(), exact)
+    def _offsets(self, action: torch.Tensor, state: TensorDictBase) -> tuple[Offset, Offset | None]:
+        """Return the offsets of the policy's action from the nearest of the expert's equal moves,
+        and of the rounded label from the label."""
+        actions, label = self.env.actions, state[keys.EXPERT_ACTION]
+        labels = state.get(keys.EXPERT_MOVES, label[None])
+        policy = nearest_offset(actions, action.numpy(), labels.unique(dim=0).numpy())
         if self.rounding is None:
             return policy, None
-        return policy, offset_of(actions, self.rounding(label).numpy(), exact)
+        return policy, offset_of(actions, self.rounding(label).numpy(), label.numpy())
 
     def _stage_name(self, is_holding: bool) -> str:
         names = ("empty", "holding") if self.is_close_loop else ("pick", "place")

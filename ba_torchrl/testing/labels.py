@@ -7,6 +7,7 @@ two states look the same.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 from contextlib import closing
 from typing import Any, NamedTuple
 
@@ -80,6 +81,16 @@ def offset_of(
     return Offset(*moves, turn, pose.primitive != other.primitive)
 
 
+def nearest_offset(
+    actions: OpenLoopActions | CloseLoopActions, action: np.ndarray, labels: Iterable[np.ndarray]
+) -> Offset:
+    """Return how far an action is from the nearest of several labels, a degree counted as 1 mm."""
+    offsets = (offset_of(actions, action, label) for label in labels)
+    return min(
+        offsets, key=lambda o: (o.is_other_primitive, math.hypot(o.distance_mm, o.rotation_deg))
+    )
+
+
 def _angle_deg(rotation: np.ndarray) -> float:
     """Return the angle of a rotation matrix."""
     sine = np.linalg.norm(rotation - rotation.T) / math.sqrt(8)
@@ -92,7 +103,7 @@ def label_jumps(
     """Return whether the expert's action jumps in a state, which is restored at the end.
 
     The arm and all bodies that move freely are displaced by up to `LAST_BITS`, and the expert is
-    asked again.
+    asked again. A change to another of its equal moves is no jump.
 
     Args:
         env: in the state.
@@ -100,7 +111,7 @@ def label_jumps(
         rng: draws the displacements.
         asks: their largest number.
     """
-    robot, label = env.scene.robot, _label(env)
+    robot, labels = env.scene.robot, _labels(env)
     bodies = [body for body in env.scene.world.bodies if body.is_free and not body.is_hidden]
     poses, joints = [body.pose for body in bodies], robot.measured_joints()
 
@@ -110,19 +121,23 @@ def label_jumps(
             turn = (*rng.uniform(-LAST_BITS / 2, LAST_BITS / 2, 3).tolist(), 1.0)
             moved = position + rng.uniform(-LAST_BITS, LAST_BITS, 3)
             body.set_pose(tuple(moved.tolist()), quaternion_product(turn, orientation))
-        return _label(env)
+        return _labels(env)[0]
 
     try:
-        return any(offset_of(env.actions, moved_label(), label).is_jump for _ in range(asks))
+        return any(nearest_offset(env.actions, moved_label(), labels).is_jump for _ in range(asks))
     finally:
         env.reset(state, set_state=True)
 
 
-def _label(env: BulletArmEnv) -> np.ndarray:
-    """Return the expert's action in the present scene."""
+def _labels(env: BulletArmEnv) -> list[np.ndarray]:
+    """Return the expert's action in the present scene, and the moves that it holds for equal."""
     scene: Scene = env.scene
     with scene.world.fixed_poses():
-        return env.actions.encode(scene.task.expert_command())
+        if getattr(scene.task, "equal_moves", 0):
+            moves = scene.task.expert_moves()
+        else:
+            moves = [scene.task.expert_command()]
+        return [env.actions.encode(move) for move in moves]
 
 
 def label_jump_share(task: str, *, episodes: int, **config: Any) -> float:

@@ -200,7 +200,7 @@ class GradedSets:
                 )
         finally:
             env.close()
-        others = (keys.EXPERT_ACTION, keys.IS_EXPERT, (keys.NEXT, keys.EXPERT_ACTION))
+        others = (*keys.OF_EXPERT, keys.IS_EXPERT, *((keys.NEXT, key) for key in keys.OF_EXPERT))
         return [episode.exclude(*others) for episode in played]
 
 

@@ -42,8 +42,10 @@ def problem_of(config: ExperimentConfig) -> Problem:
     """Return what the learner of an experiment must know of its environment."""
     env = make(config.resolved_env)
     env.close()
+    task_class = config.resolved_env.task_class
     return Problem(
-        control=config.resolved_env.task_class.control,
+        control=task_class.control,
+        equal_moves=getattr(task_class, "equal_moves", 0),
         images=env.images,
         vectors=env.vectors,
         center_m=config.resolved_env.workspace.center,

@@ -5,6 +5,7 @@ import torch
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.core import keys
+from ba_torchrl.tasks.open_loop.block_stacking import BlockStacking
 from tests.algorithms.tiny import OPEN, build, run, transitions
 
 
@@ -74,3 +75,26 @@ def test_the_executed_action_of_an_expert_is_on_the_grid(tmp_path):
     with set_exploration_type(ExplorationType.RANDOM):
         acted = learner.policy(state)[keys.ACTION]
     assert torch.equal(acted, learner.nearest_action(state[keys.EXPERT_ACTION]))
+
+
+def test_equal_moves_are_imitated_in_a_run(tmp_path, monkeypatch):
+    monkeypatch.setattr(BlockStacking, "equal_moves", 3)
+    monkeypatch.setattr(BlockStacking, "expert_moves", two_moves)
+    learner = run(tmp_path, "asr", {"name": "dagger", "rotation": {"name": "d4"}}, **OPEN)
+    column = learner.replay.storage.column
+    labels, moves = column(keys.TARGET_ACTION), column(keys.TARGET_MOVES)
+    assert moves.shape == (len(labels), 3, 4)
+    assert torch.equal(moves[:, 0], labels)
+    assert torch.equal(moves[:, 2], labels)  # the first again
+    assert (moves[:, 1] != labels).any(dim=1).all()
+    assert {True, False} == set(column(keys.IS_DEMONSTRATION).flatten().tolist())
+    batch = learner.sample()
+    found = learner.loss(batch)["accuracy"]
+    assert 0 <= float(found) <= 1
+    plain = run(tmp_path / "plain", "asr", {"name": "dagger", "equal_moves": False}, **OPEN)
+    assert keys.TARGET_MOVES not in plain.replay.storage[:].keys()  # noqa: SIM118
+
+
+def two_moves(task):
+    first = task.expert_command()
+    return [first, first._replace(x_m=0.45 - (first.x_m - 0.45))]

@@ -7,7 +7,7 @@ from torchrl.envs.utils import ExplorationType, set_exploration_type
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
-from tests.algorithms.tiny import OPEN, build, make_experiment, transitions
+from tests.algorithms.tiny import OPEN, build, make_experiment, problem, transitions
 
 
 def losses(folder, name):
@@ -33,6 +33,20 @@ def test_behaviour_cloning_learns_without_a_step_of_the_environment(tmp_path, ne
     assert found[-5:].mean() < 0.9 * found[:5].mean()
     assert losses(tmp_path, "env_steps")[-1] == 0
     assert made.learner.replay.storage.column(keys.IS_DEMONSTRATION).all()
+
+
+@pytest.mark.parametrize("known", [3, 4, None])
+def test_moves_that_are_not_known_are_the_imitated_action(known):
+    learner = build("bc", "asr", on=problem("asr", equal_moves=3))
+    data = transitions(learner)
+    data[keys.NEXT, keys.FAULT] = torch.zeros(len(data), 1, dtype=torch.bool)
+    if known:
+        data[keys.EXPERT_MOVES] = torch.rand(len(data), known, 4)
+    stored = learner.to_transitions(data, is_demonstration=True)
+    repeated = data[keys.ACTION][:, None].expand(-1, 3, -1)
+    assert torch.equal(
+        stored[keys.TARGET_MOVES], data[keys.EXPERT_MOVES] if known == 3 else repeated
+    )
 
 
 def test_demonstrations_of_the_open_loop_are_on_the_grid(tmp_path):

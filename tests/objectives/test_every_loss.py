@@ -108,6 +108,11 @@ def chunks():
     return data.set(keys.TARGET_CHUNK, chunk).set(keys.TARGET_CHUNK_MASK, is_valid)
 
 
+def sets(size=20):
+    data = level_batch(size).exclude("chosen")
+    return data.set("action", torch.stack([data["action"], data["action"].roll(1, 0)], dim=1))
+
+
 LOSSES = {
     "sacfd": (lambda **options: sac(SACfDLoss, 2, **options), continuous),
     "rlpd": (lambda **options: sac(RLPDLoss, 3, subset=3, **options), continuous),
@@ -128,6 +133,12 @@ LOSSES = {
     "level_cross_entropy": (
         lambda **options: LevelCrossEntropyLoss(SpatialValues(Tables(), ACTIONS), **options),
         lambda: level_batch(20).exclude("chosen"),
+    ),
+    "sets": (
+        lambda **options: LevelCrossEntropyLoss(
+            SpatialValues(Tables(), ACTIONS), of_sets=True, **options
+        ),
+        sets,
     ),
     "cross_entropy": (
         lambda **options: LevelCrossEntropyLoss(actor("categorical"), **options),

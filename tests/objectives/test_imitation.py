@@ -5,12 +5,15 @@ import torch
 from tensordict import TensorDict
 from torch import nn
 from torch.distributions import Bernoulli, kl_divergence
-from torchrl.modules import TanhNormal
+from torchrl.modules import QValueActor, TanhNormal
 
 from ba_torchrl.core import keys
 from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_policy
+from ba_torchrl.modules.spatial.policy import SpatialValues
 from ba_torchrl.objectives.distance import action_distance
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
+from tests.level_tables import ACTIONS, Tables
+from tests.level_tables import batch as level_batch
 from tests.linear_sac import batch
 
 
@@ -121,6 +124,61 @@ def test_cross_entropies_are_averaged_over_the_batch_and_summed_over_levels():
     assert found["loss_bc"].item() == pytest.approx(first + second, rel=1e-6)
     assert float(found["accuracy"]) == 0.5  # right at one level of two in either sample
     assert not found["accuracy"].requires_grad
+
+
+def moves_batch(samples=6, moves=4):
+    """A batch of `Tables`, with sets of actions [B, K, A] in which one action is repeated."""
+    data = level_batch(samples)
+    chosen = data["chosen"][:, None].repeat(1, moves, 1)
+    chosen[:, 1, 2:] = 0  # the same pixel and other angles
+    chosen[:, 2, 0] = (chosen[:, 2, 0] + 1) % 3  # another pixel
+    indices = chosen[:, [0, 1, 2, 0]]
+    data["action"] = ACTIONS.to_action(indices, data["holding"][:, None].expand(-1, moves, 1))
+    return data, indices
+
+
+def test_the_loss_of_a_set_is_that_of_its_summed_probability():
+    network, (data, indices) = Tables(), moves_batch()
+    loss = LevelCrossEntropyLoss(SpatialValues(network, ACTIONS), "none", of_sets=True)
+    found, expected, hits = loss(data), [], []
+    for row, sample in zip(data, indices.tolist(), strict=True):
+        primitive, scale = int(row["holding"]), float(row["heightmap"].mean())
+        left, before, total = {tuple(move) for move in sample}, (), 0.0
+        for table, size in zip(network.tables, (2, 1, 1, 1, 1), strict=True):
+            q = table[(primitive, *before)].detach().double() * scale
+            p = q.exp() / q.exp().sum()
+            ends = {move[len(before) : len(before) + size] for move in left}
+            total -= math.log(sum(float(p[end]) for end in ends))
+            hits.append(max(float(p[end]) for end in ends) == float(p.max()))
+            best = max(ends, key=lambda end: p[end])
+            before += best
+            left = {move for move in left if move[: len(before)] == before}
+        expected.append(total)
+    torch.testing.assert_close(found["loss_bc"].double(), torch.tensor(expected).double())
+    assert float(found["accuracy"]) == pytest.approx(sum(hits) / len(hits))
+    assert 0 < sum(hits) < len(hits)
+
+
+def test_the_set_of_one_action_is_that_action():
+    values, (data, _) = SpatialValues(Tables(), ACTIONS), moves_batch()
+    one = data.clone()
+    one["action"] = data["action"][:, 0]
+    data["action"] = data["action"][:, :1].expand(-1, 5, -1)
+    expected = LevelCrossEntropyLoss(values, "none")(one)
+    found = LevelCrossEntropyLoss(values, "none", of_sets=True)(data)
+    torch.testing.assert_close(dict(found), dict(expected))
+
+
+@pytest.mark.parametrize("is_one_hot", [False, True])
+def test_sets_of_a_single_level(is_one_hot):
+    actor = QValueActor(nn.Linear(3, 4), action_space="one_hot" if is_one_hot else "categorical")
+    moves, observation = torch.tensor([[0, 2, 0], [1, 1, 1]]), torch.rand(2, 3)
+    action = nn.functional.one_hot(moves, 4) if is_one_hot else moves
+    loss = LevelCrossEntropyLoss(actor, "none", of_sets=True)
+    found, _ = loss(observation=observation, action=action)
+    p = actor[0].module(observation).softmax(dim=-1)
+    expected = -torch.stack([p[0, 0] + p[0, 2], p[1, 1]]).log()
+    torch.testing.assert_close(found, expected)
 
 
 def test_the_divergence_is_that_of_bernoulli_distributions():

@@ -91,6 +91,10 @@ class RigidAugmentation(SeededTransform):
     reverses both axes. A transition is unchanged if no drawn transform keeps its action within the
     workspace.
 
+    Equal moves [K, A] under ``target_moves`` are transformed too. Moves that would leave the
+    workspace, and places that would need the other orientation of the image of what is held, become
+    the first move.
+
     Args:
         transforms: set of transforms, see `RigidTransforms`.
         actions: the environment's action vector.
@@ -187,6 +191,8 @@ class RigidAugmentation(SeededTransform):
         moved = action.clone()
         moved[rows], is_turned_over = self._transform_actions(action[rows], transform)
         out.set(self._action_key, to_device(moved, device))
+        if keys.TARGET_MOVES in out:
+            self._transform_moves(out, rows, transform, is_turned_over)
         for chosen, axes in ((transform.mirrored, "y"), (is_turned_over, "xy")):
             if chosen.any():
                 self._reverse_axes(out, rows[chosen], axes)
@@ -262,6 +268,36 @@ class RigidAugmentation(SeededTransform):
             is_turned_over ^= self._grid.swaps_fingers(moved)
             moved = self._grid.nearest(moved)
         return moved, is_turned_over
+
+    def _transform_moves(
+        self,
+        out: TensorDictBase,
+        rows: Tensor,
+        transform: RigidTransform,
+        is_turned_over: Tensor,
+    ) -> None:
+        """Transform the equal moves in some rows of a batch, whose first moves are the actions.
+
+        Args:
+            out: the batch, whose images with the gripper's axes are not reversed yet.
+            rows: int64 [R].
+            transform: of these rows.
+            is_turned_over: whether these images are reversed with both axes, bool [R].
+        """
+        moves = out[keys.TARGET_MOVES]
+        chosen = moves.cpu()[rows]
+        count = chosen.shape[1]
+        flat = chosen.flatten(0, 1)
+        each = RigidTransform(*(part.repeat_interleave(count, dim=0) for part in transform))
+        turned, is_over = self._transform_actions(flat, each)
+        fits = self._stays_inside(flat, each).reshape(-1, count)
+        holding = out[keys.HOLDING].cpu()[rows].reshape(-1, 1)
+        fits &= ~holding | (is_over.reshape(-1, count) == is_turned_over[:, None])
+        turned = turned.reshape(chosen.shape)
+        turned = torch.where(fits[:, :, None], turned, turned[:, :1])
+        changed = moves.clone()
+        changed[to_device(rows, moves.device)] = to_device(turned, moves.device)
+        out.set(keys.TARGET_MOVES, changed)
 
     def _reverse_axes(self, out: TensorDictBase, rows: Tensor, axes: str) -> None:
         """Reverse axes of the images with the gripper's axes, in some rows of a batch."""

@@ -218,6 +218,37 @@ class SpatialValues(nn.Module):
             found.append((q.flatten(1), self.actions.ravel(indices, level)))
         return found
 
+    def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return the values of every level, and which choices are those of one of several actions.
+
+        The values of a level, and the actions that count there, are those after the choice of the
+        greatest value among the actions at each level before.
+
+        Args:
+            observation_and_moves: the images [B, C, H, W] each, the holding flag [B, 1] and the
+                actions [B, K, A].
+
+        Returns:
+            For each level the values of all its choices [B, N], and bool [B, N].
+        """
+        *observation, moves = observation_and_moves
+        indices = self.actions.to_indices(moves)
+        counts = torch.ones(indices.shape[:2], dtype=torch.bool, device=indices.device)
+        chosen = indices[:, 0]
+        q, state = self.network.first(*observation)
+        found: list[tuple[Tensor, Tensor]] = []
+        for level in range(len(self.actions.levels)):
+            if level:
+                q = self.network.later(level, state, self.actions.before(chosen, level))
+            values, flat = q.flatten(1), self.actions.ravel(indices, level)
+            times = torch.zeros_like(values).scatter_add_(1, flat, counts.to(values))
+            found.append((values, times > 0))
+            own = values.detach().gather(1, flat).masked_fill(~counts, -math.inf)
+            best = own.argmax(dim=1, keepdim=True)
+            counts = counts & (flat == flat.gather(1, best))
+            chosen = indices.take_along_dim(best[:, :, None], dim=1)[:, 0]
+        return found
+
 
 class SpatialPolicy(nn.Module):
     """Epsilon-greedy policy on spatial Q values.

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -58,6 +59,8 @@ OPEN_COST_M = 0.01
 """Cost of a site without enclosing surroundings, as a height."""
 TIE_M = 0.0015
 """Costs within this of the least one are equal."""
+SPACING_M = 0.005
+"""Edge of the squares of which each has at most one of the equal sites."""
 ORDER = (1.0, 0.3)
 """Weights of the distances along and across the bin in the order of equal sites."""
 
@@ -102,6 +105,7 @@ class BinPacking(PackingTask):
     """
 
     expert_version = 1
+    equal_moves = 32
     scale_limits = (0.78, 0.86)
     max_steps = 20
     num_objects = 8
@@ -188,27 +192,41 @@ class BinPacking(PackingTask):
     def expert_command(self) -> PickPlaceCommand:
         """Pick the largest object that can be grasped, of equals that nearest to the bin, and drop
         it in the bin."""
+        return next(self._moves())
+
+    def expert_moves(self) -> list[PickPlaceCommand]:
+        """Return that command, then picks of the equally large objects from all free sides, or
+        drops at the equally good sites."""
+        return list(itertools.islice(self._moves(), self.equal_moves))
+
+    def _moves(self) -> Iterator[PickPlaceCommand]:
+        """Yield the command of `expert_command` and its equals."""
         held = self.robot.held_body()
         if held is not None:
-            return self._drop(held)
+            yield from self._drops(held)
+            return
         outside = [body for body in self.objects if not self.is_packed(body)]
         if not outside:
-            return no_op(self.settings.workspace, is_holding=False)
-        grasps = {body: self.grasp(body) for body in outside}
+            yield no_op(self.settings.workspace, is_holding=False)
+            return
+        grasps = {body: self.equal_grasps(body) for body in outside}
 
         def order(body: Body) -> tuple[float, float, float]:
-            clearance = grasps[body].clearance_m
+            clearance = grasps[body][0].clearance_m
             if clearance <= 0:
                 return clearance, 0.0, 0.0
             size = float(np.ptp(body.shape.vertices, axis=0).prod())
             distance_m = math.dist(body.position[:2], self.container.position[:2])
             return math.inf, round(size, 7), -distance_m
 
-        body = max(outside, key=order)
-        grasp = grasps[body]
-        if grasp.clearance_m <= 0:
-            return perturbed_pick(self.world, body, grasp.tool, self.action_limits)
-        return pick_command(grasp.tool)
+        ranked = sorted(outside, key=order, reverse=True)
+        first = grasps[ranked[0]][0]
+        if first.clearance_m <= 0:
+            yield perturbed_pick(self.world, ranked[0], first.tool, self.action_limits)
+            return
+        for body in ranked:
+            if order(body)[:2] == order(ranked[0])[:2]:
+                yield from (pick_command(grasp.tool) for grasp in grasps[body])
 
     def grasp_sides(self, body: Body) -> list[Rectangle]:
         """Return the sides between which fingers fit, first those with the hand along the bin's
@@ -247,11 +265,11 @@ class BinPacking(PackingTask):
             for along, across, *half in ends + sides
         ]
 
-    def _drop(self, held: Body) -> PickPlaceCommand:
-        """Return the place that drops an object at the site with the lowest cost.
+    def _drops(self, held: Body) -> Iterator[PickPlaceCommand]:
+        """Yield the places that drop an object at the sites with the lowest costs.
 
-        Of equal orientations, it is the one in which fingers close along the bin; of equal sites,
-        the one nearest to the corner farthest from the workspace's centre.
+        Of equal orientations, that in which fingers close along the bin comes first; of equal
+        sites, the one nearest to the corner farthest from the workspace's centre.
         """
         inside, tool_yaw = self._inside(), self.robot.tool_pose()[1]
         own, heights = outline(held, tool_yaw), self._heights()
@@ -262,20 +280,26 @@ class BinPacking(PackingTask):
         found = [_Sites.of(heights, half) for half in turned]
         least = [sites.costs.min(initial=math.inf) for sites in found]
         number = next(i for i, cost in enumerate(least) if cost <= min(least) + TIE_M)
-        yaw, sites = yaws[number], found[number]
-        site, top = (0.0, 0.0), 0.0  # of an object that is too large for the bin
-        if sites.costs.size:
-            away = np.sign(inside.frame.to_local(*self.settings.workspace.center)) * -1.0
-            order = sites.centers @ (away * ORDER)
-            order[sites.costs > least[number] + TIE_M] = -math.inf
-            index = np.unravel_index(int(order.argmax()), order.shape)
-            site, top = sites.centers[index].tolist(), float(sites.tops[index])
-        x, y = inside.frame.to_world(*site)
-        z = max(self._release_m(), top + self.depth_m(held) + RELEASE_GAP_M)
         # the centre of the outline is placed at the site, not the origin of the object
         ox, oy = held.position[0] - own.x, held.position[1] - own.y
-        at = PlanarFrame(x, y, yaw - tool_yaw).to_world(ox, oy)
-        return self.place(held, (*at, held.position[2]), yaw - tool_yaw)._replace(z_m=z)
+
+        def drop(yaw: float, site: Sequence[float], top: float) -> PickPlaceCommand:
+            x, y = inside.frame.to_world(*site)
+            z = max(self._release_m(), top + self.depth_m(held) + RELEASE_GAP_M)
+            at = PlanarFrame(x, y, yaw - tool_yaw).to_world(ox, oy)
+            return self.place(held, (*at, held.position[2]), yaw - tool_yaw)._replace(z_m=z)
+
+        if not found[number].costs.size:  # the object is too large for the bin
+            yield drop(yaws[number], (0.0, 0.0), 0.0)
+            return
+        away = np.sign(inside.frame.to_local(*self.settings.workspace.center)) * -1.0
+        for i in (number, *(i for i in range(len(yaws)) if i != number)):
+            sites = found[i].within(least[number] + TIE_M)
+            ranked = np.argsort(-(sites.centers @ (away * ORDER)), kind="stable")
+            cells = np.round(sites.centers[ranked] / SPACING_M)
+            _, kept = np.unique(cells, axis=0, return_index=True)
+            for j in ranked[np.sort(kept)]:
+                yield drop(yaws[i], sites.centers[j].tolist(), float(sites.tops[j]))
 
     def _heights(self) -> np.ndarray:
         """Return the height image of the bin with its walls, rows along its length."""
@@ -293,6 +317,11 @@ class _Sites(NamedTuple):
     """[R, C] heights of their highest points."""
     costs: np.ndarray
     """[R, C] costs: low, even and enclosed by their surroundings is best. All in metres."""
+
+    def within(self, cost_m: float) -> _Sites:
+        """Return the sites with at most this cost, in one dimension."""
+        chosen = self.costs <= cost_m
+        return _Sites(self.centers[chosen], self.tops[chosen], self.costs[chosen])
 
     @classmethod
     def of(cls, heights: np.ndarray, half_m: tuple[float, float]) -> _Sites:

@@ -156,25 +156,35 @@ class PackingTask(OpenLoopTask):
 
     def grasp(self, body: Body) -> TopDownGrasp:
         """Return the grasp of an object, off its centre if that increases the clearance."""
+        return self.equal_grasps(body)[0]
+
+    def equal_grasps(self, body: Body) -> list[TopDownGrasp]:
+        """Return the grasp of an object, then those of its other sides that are as good."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         gripper = self.robot.gripper
         obstacles = self.obstacles(body, height + self.tips_m)
         hand_obstacles = self.obstacles(body, height + gripper.palm_height_m)
         half_open = half_gap_m(gripper, self.finger_opening)
-        tools = [
-            PlanarFrame(*side.frame.to_world(0.0, offset * self.unit), side.yaw_rad)
-            for side in self.grasp_sides(body)
+        sides = [
+            (number, PlanarFrame(*side.frame.to_world(0.0, offset * self.unit), side.yaw_rad))
+            for number, side in enumerate(self.grasp_sides(body))
             for offset in self.grasp_offsets_m
             if abs(offset * self.unit) <= max(side.half_y - 0.012, 0.0)
         ]
+        tools = [tool for _, tool in sides]
         hands = [hand_rectangle(self.robot, tool) for tool in tools]
         clearances_m = np.minimum(
             outline_clearances_m(gripper, tools, half_open, obstacles),
             gaps_m(hands, hand_obstacles).min(axis=1, initial=math.inf),
         )
-        best = int(np.minimum(clearances_m, SUFFICIENT_CLEARANCE_M).argmax())
-        x, y, yaw = tools[best]
-        return TopDownGrasp(body, (x, y, height), yaw, float(clearances_m[best]))
+        capped_m = np.minimum(clearances_m, SUFFICIENT_CLEARANCE_M)
+        first: dict[int, int] = {}  # of each side
+        for i in np.flatnonzero(capped_m == capped_m.max()).tolist():
+            first.setdefault(sides[i][0], i)
+        return [
+            TopDownGrasp(body, (*tools[i][:2], height), tools[i].yaw_rad, float(clearances_m[i]))
+            for i in first.values()
+        ]
 
     def grasp_sides(self, body: Body) -> list[Rectangle]:
         """Return the outlines of an object whose x axes are directions in which fingers close."""

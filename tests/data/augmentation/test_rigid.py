@@ -270,6 +270,44 @@ def test_another_action_is_transformed_alone():
     assert "action" not in out
 
 
+@pytest.mark.parametrize("holding", [False, True])
+@pytest.mark.parametrize("transforms", ["d4", "se2"])
+def test_every_equal_move_is_transformed_as_the_action_is(transforms, holding):
+    count, places = 40, [(0.45, -0.05), (0.45, 0.05), (0.26, -0.19)]
+    yaws = [0.3, 0.3 + math.pi / 2, 1.0]
+    data, moves = batch(places[:1] * count, [0.3] * count), batch(places, yaws)["action"]
+    data["target_moves"] = moves.expand(count, 3, -1)
+    data["holding"] = torch.full((count, 1), holding)
+    out = augmentation(transforms, layout())(data)
+    torch.testing.assert_close(out["target_moves"][:, 0], out["action"])
+    lost = 0
+    for j in (1, 2):
+        # where the first move went says how the scene moved
+        for first, move, image in zip(
+            out["action"], out["target_moves"][:, j], out["in_hand"], strict=True
+        ):
+            seen = [reverse_in_hand(data["in_hand"][:1], axes)[0] for axes in ("", "xy", "y", "x")]
+            is_mirrored = [torch.equal(image, each) for each in seen].index(True) >= 2
+            sign = -1 if is_mirrored else 1
+            is_over = torch.equal(image, seen[1]) or torch.equal(image, seen[3])
+            angle = float(first[3]) - sign * yaws[0] + math.pi * is_over
+            turned = sign * yaws[j] + angle
+            wraps = bool(math.floor(turned / math.pi) % 2) != is_over
+            start, end = (torch.tensor(place) for place in (places[0], places[j]))
+            dx, dy = (end - start).tolist()
+            dy *= sign
+            x = float(first[1]) + math.cos(angle) * dx - math.sin(angle) * dy
+            y = float(first[2]) + math.sin(angle) * dx + math.cos(angle) * dy
+            leaves = not (0.25 <= x <= 0.65 and -0.2 <= y <= 0.2)
+            if leaves or (holding and wraps):
+                lost += 1
+                assert torch.equal(move, first)
+            else:
+                expected = torch.tensor([0.0, x, y, turned % math.pi])
+                torch.testing.assert_close(move, expected, atol=1e-5, rtol=0)
+    assert (0 < lost < 2 * count) == (holding or transforms == "se2")
+
+
 def test_transforms_that_the_action_cannot_follow_are_refused():
     with pytest.raises(ValueError, match="no yaw to rotate with it; use 'translation'"):
         augmentation("se2", layout("pxy"), seed=0)

@@ -4,11 +4,12 @@ import math
 
 import numpy as np
 import pytest
+import torch
 from numpy.lib.stride_tricks import sliding_window_view
 
 from ba_torchrl.sim.geometry import yaw_quaternion
-from ba_torchrl.tasks.manipulation.footprints import Rectangle
-from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, _window_maxima, object_shapes
+from ba_torchrl.tasks.manipulation.footprints import Rectangle, outline
+from ba_torchrl.tasks.open_loop.bin_packing import BIN_M, BinPacking, _window_maxima, object_shapes
 from ba_torchrl.testing.labels import offset_of
 from tests.tasks.episodes import follow
 from tests.tasks.packing.scenes import BIN, QUARTER_TURN
@@ -104,6 +105,25 @@ def test_the_expert_decides_by_what_the_image_shows(make_env):
         (state,) = follow(env, state, 1)
     assert state["success"]
     assert len(seen) > 10
+
+
+def test_any_of_the_equal_moves_solves_the_task(make_env):
+    env = make_env(BIN)
+    state, counts = env.reset(), {False: [], True: []}
+    while not state["done"]:
+        moves = state["expert_moves"]
+        assert moves.shape == (BinPacking.equal_moves, 4)
+        assert torch.equal(moves[0], state["expert_action"])
+        different = moves.unique(dim=0)
+        task, held = env.scene.task, env.scene.controller.held
+        counts[held is not None].append(len(different))
+        aims = [task.container] if held is not None else task.objects
+        for at in different[:, 1:3].numpy():
+            assert any(outline(body).contains(at[None]) for body in aims)
+        (state,) = follow(env, state, 1, action=different[len(different) // 2])
+    assert state["success"]
+    assert max(counts[False]) > 1
+    assert max(counts[True]) > 8
 
 
 def test_equal_sites_are_filled_from_the_corner_farthest_from_the_workspaces_centre(make_env):
