@@ -154,7 +154,7 @@ def film_frames(task: str, seed: int) -> tuple[list[np.ndarray], float]:
     """
     if task in shipped_policies():
         policy = load_policy(task)
-        resolved = policy.config.resolved_env
+        resolved = policy.config.env
     else:
         policy, resolved = expert_policy, resolve_env(task, {"expert": True})
     succeeded: list[bool] = []

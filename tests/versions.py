@@ -228,7 +228,7 @@ def check_update(values: dict[str, object]) -> None:
 
     config = ExperimentConfig.parse(values)
     learner = build_learner(config)
-    env = make_vector_env(config.resolved_env, 1, parallel=False, seed=0, expert=True)
+    env = make_vector_env(config.env, 1, parallel=False, seed=0, expert=True)
     try:
         episodes = collect_demonstrations(env, 2, seed=0, nearest_action=learner.nearest_action)
     finally:

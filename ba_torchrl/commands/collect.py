@@ -23,7 +23,7 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.core.config import LocalPath, Source
 from ba_torchrl.core.files import atomic_output
-from ba_torchrl.envs.settings import check_env
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.logging import progress_bar
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
 
@@ -62,17 +62,16 @@ class Settings(VectorSettings, EnvSettings):
 def main(settings: Settings) -> None:
     """Play the expert's episodes, or deconstruct structures, and write them into a folder."""
     task, source, seed = settings.task, settings.source, settings.seed
-    check_env(task, settings.env)  # before the import of torch
+    resolved = resolve_env(task, settings.env)
     if source == "deconstruction":
         check_has_structure(task)
     from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
     from ba_torchrl.demonstrations.demo_files import save_demonstrations
     from ba_torchrl.demonstrations.episodes import is_success, mean_length, success_rate
 
-    fields = {**settings.env, **source_config(source)}
     with atomic_output(settings.folder) as scratch:
         with (
-            settings.make_env(task, seed=seed, **fields) as env,
+            settings.make_env(resolved, seed=seed, **source_config(source)) as env,
             progress_bar(total=settings.episodes, unit="episode") as bar,
         ):
             episodes = collect_demonstrations(
@@ -83,8 +82,8 @@ def main(settings: Settings) -> None:
                 only_successful=settings.only_successful,
                 noise=settings.noise,
                 turn_noise=settings.turn_noise,
-                turns=env.resolved.actions.turns,
-                primitive=env.resolved.actions.primitive,
+                turns=resolved.actions.turns,
+                primitive=resolved.actions.primitive,
                 on_episode=lambda episode: bar.update(
                     is_success(episode) or not settings.only_successful
                 ),

@@ -57,7 +57,7 @@ def main(settings: Settings) -> None:
     from ba_torchrl.training.protocol import PROTOCOL
 
     policy = load_policy(settings.policy, settings.which, settings.device)
-    resolved = policy.config.resolved_env
+    resolved = policy.config.env
     seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
     found = play(policy, settings, seed)
     text = success_text(found.success_rate, found.episodes, policy.task)
@@ -88,7 +88,7 @@ def play(
     from ba_torchrl.training.protocol import run_test
 
     with (
-        settings.make_env(policy.config.resolved_env) as env,
+        settings.make_env(policy.config.env) as env,
         progress_bar(total=settings.episodes, unit="episode") as bar,
     ):
         updates, episodes = policy.updates, settings.episodes

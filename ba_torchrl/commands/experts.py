@@ -24,7 +24,7 @@ from ba_torchrl.cli.types import (
 )
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import write_text
-from ba_torchrl.envs.settings import check_env
+from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.summary import pipes
 from ba_torchrl.sim.robots.base import ROBOTS
 from ba_torchrl.tasks.base import TASKS
@@ -73,7 +73,7 @@ def main(settings: Settings) -> None:
     """Play the experts' episodes and print their success and length."""
     chosen, tables = settings.tasks or list_tasks(), []
     for task in chosen:
-        check_env(task, settings.env)
+        resolve_env(task, settings.env)  # before a table is begun
     for table, columns in COLUMNS.items():
         tasks = [task for task in chosen if _table_of(task) == table]
         cells = [(task, robot) for task in tasks for robot in settings.robots]

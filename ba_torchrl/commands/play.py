@@ -15,7 +15,7 @@ from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, Fps, TaskId, VideoFile
 from ba_torchrl.core.config import LocalPath
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
-from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
@@ -42,13 +42,11 @@ class Settings(EnvSettings):
 
 def main(settings: Settings) -> None:
     """Play episodes and write a video of them."""
-    if settings.task is not None and settings.policy in ("expert", "random"):
-        check_env(settings.task, settings.env)  # before the import of torch
+    resolved, policy = _task_and_policy(settings)
     import torch
 
     from ba_torchrl.training.evaluation import record_episodes
 
-    resolved, policy = _task_and_policy(settings)
     torch.manual_seed(settings.seed)
     frames = record_episodes(
         resolved, policy, settings.episodes, settings.seed, on_episode=_print_episode
@@ -66,16 +64,17 @@ def _print_episode(number: int, steps: int, is_success: bool) -> None:
 
 def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
     """Return the environment and the policy that acts, None for random actions."""
-    from ba_torchrl import load_policy
-    from ba_torchrl.envs.policies import expert_policy
-
     is_loaded = settings.policy not in ("expert", "random")
     if settings.task is None and (not is_loaded or settings.policy == "trained"):
         raise ConfigError(f"task is missing: policy={settings.policy} acts in any, see --help")
     if not is_loaded:
         is_expert = settings.policy == "expert"
         resolved = resolve_env(settings.task, {**settings.env, "expert": is_expert})
+        from ba_torchrl.envs.policies import expert_policy  # imports torch
+
         return resolved, expert_policy if is_expert else None
+    from ba_torchrl import load_policy
+
     try:
         policy = load_policy(settings.task if settings.policy == "trained" else settings.policy)
     except UnknownNameError as error:
@@ -83,7 +82,7 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
         raise UnknownNameError(error.kind, error.name, known, error.hint) from None
     if settings.task not in (None, policy.task):
         raise ConfigError(f"task: {settings.policy} is a policy of {policy.task}")
-    return policy.config.resolved_env.changed(**settings.env), policy
+    return policy.config.env.changed(**settings.env), policy
 
 
 COMMAND = Command(main, Settings, positional="task")

@@ -17,7 +17,7 @@ from pydantic import Field
 from ba_torchrl.cli import config_dir
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, NumEnvs, TaskId, Text, as_list
-from ba_torchrl.envs.settings import check_env
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.config import ExperimentConfig
 
@@ -55,8 +55,7 @@ class Settings(EnvSettings):
 
 def main(settings: Settings) -> None:
     """Print a table, row by row."""
-    for task in settings.tasks:
-        check_env(task, settings.env)  # before the import of torch
+    envs = {task: resolve_env(task, settings.env) for task in settings.tasks}
     from ba_torchrl.training.precision import compute_path
     from ba_torchrl.training.presets import started
 
@@ -69,20 +68,22 @@ def main(settings: Settings) -> None:
             (f"{settings.num_envs} in this process", settings.num_envs, False),
             (f"{settings.num_envs} processes", settings.num_envs, True),
         ):
-            rate = steps_per_second(task, settings, num_envs, parallel)
+            rate = steps_per_second(envs[task], settings, num_envs, parallel)
             print(f"{task:34} {name:17} {rate:10.1f} steps")
         for config in learners[task]:
             rate = updates_per_second(config, settings)
             print(f"{task:34} {config.label:17} {rate:10.2f} updates, {compute_path(config)}")
 
 
-def steps_per_second(task: str, settings: Settings, num_envs: int, parallel: bool) -> float:
+def steps_per_second(
+    resolved: ResolvedEnv, settings: Settings, num_envs: int, parallel: bool
+) -> float:
     """Return the steps of all environments together, in which the expert acts, per second."""
     from ba_torchrl import make_vector_env
     from ba_torchrl.demonstrations import expert_policy
 
-    options = {**settings.env, "parallel": parallel, "register_modules": settings.plugins}
-    env = make_vector_env(task, num_envs, **options, seed=settings.seed, expert=True)
+    options = {"parallel": parallel, "register_modules": settings.plugins}
+    env = make_vector_env(resolved, num_envs, **options, seed=settings.seed, expert=True)
     with closing(env):
         state = env.reset()
 
@@ -121,7 +122,7 @@ def updates_per_second(config: ExperimentConfig, settings: Settings) -> float:
 
     learner = build_learner(config)
     options = {"parallel": False, "seed": settings.seed, "expert": True}
-    with closing(make_vector_env(config.resolved_env, 1, **options)) as env:
+    with closing(make_vector_env(config.env, 1, **options)) as env:
         learner.on_demonstrations(collect_demonstrations(env, 5, seed=settings.seed))
 
     def wait() -> None:

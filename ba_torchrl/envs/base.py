@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from abc import abstractmethod
 from collections.abc import Callable, Iterator
+from pkgutil import resolve_name
 from typing import Any, ClassVar
 
 import numpy as np
@@ -27,7 +28,7 @@ from ba_torchrl.envs.observations import (
 )
 from ba_torchrl.envs.rendering import WORKSPACE_VIEW, Direction, RelativePoint, scene_viewpoint
 from ba_torchrl.envs.scene import Controller, Scene, build_scene, check_action_limits
-from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv, resolve_env
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.camera import Camera
 from ba_torchrl.sim.vision.rgb import DEFAULT_FLOOR_RGB, render_rgb
@@ -67,7 +68,7 @@ class _MadeByTask(type(EnvBase)):
     ) -> BulletArmEnv:
         if cls is BulletArmEnv:
             resolved = resolve_env(task, config)
-            env = CONTROLS[resolved.task_class.control](resolved)
+            env = resolve_name(resolved.control.env)(resolved)
         elif not isinstance(task, ResolvedEnv):
             raise TypeError(
                 f"{cls.__name__} takes what resolve_env returned, not {task!r}: call BulletArmEnv"
@@ -143,8 +144,6 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     """Settings of the physics engine for ``physics_mode="fast"``."""
     hand_point: ClassVar[RelativePoint] = RelativePoint(0.0, 0.0, 0.28)
     """A point of the hand that `render` shows besides the workspace."""
-    video_fps: ClassVar[int] = 5
-    """Frames of a video per second."""
     video_caption: ClassVar[str] = ""
     """Text in every frame of a video."""
 

@@ -9,13 +9,12 @@ import torch
 from torchrl.data import Bounded
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.actions import CloseLoopActions
 from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.images import Frame, ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.episode_positions import RecordedPosition
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
+from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.sim.control.close_loop import CloseLoopController
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.vision.camera import Camera
@@ -30,7 +29,6 @@ HALF_TURN = (-math.pi / 2, math.pi / 2)
 """Range of the yaw with `half_rotation`; episodes start at its centre."""
 
 
-@CONTROLS.register("close_loop")
 class CloseLoopEnv(RecordedPosition, BulletArmEnv):
     """A task under close-loop control (paper section 3.2, appendix A.2, G.2).
 
@@ -39,9 +37,6 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
     that moves with the tool and does not rotate with it. The fingers are drawn as squares of zero.
     Other views are in `ba_torchrl.sim.vision.camera_views`.
     """
-
-    default_action_sequence = "pxyzr"
-    default_half_rotation = False
 
     def __init__(self, resolved: ResolvedEnv) -> None:
         config, workspace, robot = resolved.config, resolved.workspace, resolved.robot_class
@@ -56,11 +51,6 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
             finger_span_m=robot.finger_span_m,
         )
         super().__init__(resolved)
-
-    @classmethod
-    def make_actions(cls, config: EnvConfig) -> CloseLoopActions:
-        """Return the action space; see `ControlEnv`."""
-        return CloseLoopActions(config.action_sequence, config.dpos, config.drot)
 
     @property
     def action_limits(self) -> ActionLimits:

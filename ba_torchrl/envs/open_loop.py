@@ -12,16 +12,14 @@ import torch
 from torchrl.data import Bounded
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.actions import PICK, PLACE, OpenLoopActions, PickPlaceCommand
-from ba_torchrl.core.env_config import EnvConfig
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.actions import PICK, PLACE, PickPlaceCommand
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.episode_positions import RecordedPosition
 from ba_torchrl.envs.episodes import SETTLE_STEPS
 from ba_torchrl.envs.rendering import ARM_VIEW, DISPLAY_POINT, DISPLAY_YAW_RAD, ArmDisplay
 from ba_torchrl.envs.scene import Scene
-from ba_torchrl.envs.settings import CONTROLS, ResolvedEnv
+from ba_torchrl.envs.settings import ResolvedEnv
 from ba_torchrl.sim.control.pick_place import PickPlace, PickPlaceLimits
 from ba_torchrl.sim.geometry import downward, tool_rotation
 from ba_torchrl.sim.robots.base import Robot
@@ -34,7 +32,6 @@ from ba_torchrl.tasks.workspace import ActionLimits
 HOME_TOLERANCE_RAD = 1e-6
 
 
-@CONTROLS.register("open_loop")
 class OpenLoopEnv(RecordedPosition, BulletArmEnv):
     """A task under open-loop control (paper section 3.2, appendix A.1, G.1).
 
@@ -46,10 +43,7 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
     the workspace, without the arm and the held object.
     """
 
-    default_action_sequence = "pxyr"
-    default_half_rotation = True
     hand_point = DISPLAY_POINT._replace(height_m=0.23)
-    video_fps = 10
     video_caption = "arm motion between poses: interpolated"
     # a stack of four creeps by 0.15 mm in two seconds; without a residual, by 0.11 mm
     physics = Physics(time_step_s=1 / 240, solver_iterations=30, solver_residual=1e-5)
@@ -58,16 +52,6 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
         self._in_hand_kind = IN_HAND_MODES[resolved.config.in_hand_mode]()
         self._display = ArmDisplay(partial(self._build_scene, window=False))
         super().__init__(resolved)
-
-    @classmethod
-    def make_actions(cls, config: EnvConfig) -> OpenLoopActions:
-        """Return the action space; see `ControlEnv`."""
-        x, y, _ = config.workspace
-        if not math.isclose(x[1] - x[0], y[1] - y[0], rel_tol=1e-6):
-            raise ConfigError("workspace: an open-loop task needs a square one, x as wide as y")
-        return OpenLoopActions(
-            config.action_sequence, config.workspace, half_rotation=config.half_rotation
-        )
 
     @property
     def action_limits(self) -> ActionLimits:

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 from ba_torchrl.core.actions import CloseLoopActions, OpenLoopActions
 from ba_torchrl.core.config import parse
@@ -18,9 +19,11 @@ from ba_torchrl.tasks.base import TASKS, Task, TaskSettings
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
 
-class ControlEnv(Protocol):
-    """What the class of environments of a control declares besides `BulletArmEnv`."""
+class ControlConfig(ABC):
+    """What a control declares besides its environments. Its module imports no torch."""
 
+    env: ClassVar[str]
+    """The class of its environments, as "module:class"."""
     default_action_sequence: ClassVar[str]
     """Default `action_sequence`."""
     default_half_rotation: ClassVar[bool]
@@ -29,18 +32,21 @@ class ControlEnv(Protocol):
     """Frames of a video per second."""
 
     @classmethod
+    @abstractmethod
     def make_actions(cls, config: EnvConfig) -> CloseLoopActions | OpenLoopActions:
         """Return the action space."""
 
 
-CONTROLS: Registry[type[ControlEnv]] = Registry("kind of control", "ba_torchrl.envs")
+CONTROLS: Registry[type[ControlConfig]] = Registry(
+    "kind of control", "ba_torchrl.envs", ControlConfig, "_config"
+)
 
 
 @dataclass(frozen=True)
 class ResolvedEnv:
     """A task and the parameters of its environment, which `resolve_env` returns.
 
-    Another process that unpickles it imports `modules` and validates the values again.
+    Another process that unpickles it imports `modules` first.
     """
 
     task_id: str
@@ -51,8 +57,11 @@ class ResolvedEnv:
     """The action space."""
     modules: tuple[str, ...]
     """Modules outside the package to import before the environment can be made."""
-    given: Mapping[str, Any] = field(compare=False)
-    """The values from which the parameters were resolved."""
+
+    @property
+    def given(self) -> dict[str, Any]:
+        """The parameters that are not defaults of the task or the control."""
+        return self.config.model_dump(exclude_unset=True)
 
     @property
     def task_class(self) -> type[Task]:
@@ -60,9 +69,14 @@ class ResolvedEnv:
         return TASKS[self.task_id]
 
     @property
+    def control(self) -> type[ControlConfig]:
+        """What the task's control declares."""
+        return CONTROLS[self.task_class.control]
+
+    @property
     def video_fps(self) -> int:
         """Frames of a video per second."""
-        return CONTROLS[self.task_class.control].video_fps
+        return self.control.video_fps
 
     @property
     def robot_class(self) -> type[Robot]:
@@ -98,12 +112,18 @@ class ResolvedEnv:
                 check_spawned_process_knows(registry.kind, name)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return resolve_env, (self.task_id, dict(self.given), None, self.modules)
+        return _blank, (self.modules,), dict(vars(self))
+
+
+def _blank(modules: Iterable[str]) -> ResolvedEnv:
+    """Import modules, and return what gets its fields from a pickle."""
+    import_modules(modules)
+    return ResolvedEnv.__new__(ResolvedEnv)
 
 
 def resolve_env(
     task: str | ResolvedEnv,
-    values: dict[str, Any],
+    values: Mapping[str, Any],
     what: str | None = None,
     modules: Iterable[str] = (),
 ) -> ResolvedEnv:
@@ -131,8 +151,14 @@ def resolve_env(
         values, modules = {**task.given, **values}, (*task.modules, *modules)
     task_id = task.task_id if isinstance(task, ResolvedEnv) else task
     import_modules(modules)
-    config, given = check_env(task_id, values, what)
     task_class = TASKS[task_id]
+    model = env_config_model(task_class.Parameters)
+    given = _own_values(task_id, values, model)
+    known = model.fields_for(task_class.control)
+    config = parse(model, given, what or f"configuration of {task_id}", known)
+    config.check_control(task_id, task_class.control)
+    _check_task_supports(task_id, config)
+    _ = ROBOTS[config.robot]  # raises with the known names
     config = _with_defaults(task_class, config)
     actions = CONTROLS[task_class.control].make_actions(config)
     missing = sorted(task_class.required_action_components - set(actions.components))
@@ -143,36 +169,15 @@ def resolve_env(
         )
     registering = (module for *_, module in _plugins(task_id, config) if module not in MAIN)
     modules = tuple(dict.fromkeys([*modules, *registering]))
-    from ba_torchrl.envs.observations import enabled_classes  # imports torch
+    if config.camera_size is not None:
+        from ba_torchrl.envs.observations import enabled_classes  # imports torch
 
-    uses_camera = any(part.uses_camera for part in enabled_classes(config))
-    if config.camera_size is not None and not uses_camera:
-        raise ConfigError(
-            "camera_size has no effect without rgb=True, or 'wrist_rgb' or 'segmentation' in "
-            "observations"
-        )
-    return ResolvedEnv(task_id, config, actions, modules, given)
-
-
-def check_env(
-    task_id: str, values: dict[str, Any], what: str | None = None
-) -> tuple[EnvConfig, dict[str, Any]]:
-    """Validate the parameters of an environment as far as this needs no torch.
-
-    Arguments and errors are as in `resolve_env`.
-
-    Returns:
-        The parameters, and the values from which they follow.
-    """
-    task_class = TASKS[task_id]
-    model = env_config_model(task_class.Parameters)
-    given = _own_values(task_id, values, model)
-    known = model.fields_for(task_class.control)
-    config = parse(model, given, what or f"configuration of {task_id}", known)
-    config.check_control(task_id, task_class.control)
-    _check_task_supports(task_id, config)
-    _ = ROBOTS[config.robot]  # raises with the known names
-    return config, given
+        if not any(part.uses_camera for part in enabled_classes(config)):
+            raise ConfigError(
+                "camera_size has no effect without rgb=True, or 'wrist_rgb' or 'segmentation' in "
+                "observations"
+            )
+    return ResolvedEnv(task_id, config, actions, modules)
 
 
 def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], str, str]]:
@@ -181,17 +186,18 @@ def _plugins(task_id: str, config: EnvConfig) -> Iterator[tuple[Registry[Any], s
     Yields:
         Registry, name in it, and module.
     """
-    from ba_torchrl.envs.observations import OBSERVATIONS  # imports torch
-
     parts = [(TASKS, task_id), (ROBOTS, config.robot)]
-    parts += [(OBSERVATIONS, name) for name in config.observations]
+    if config.observations:
+        from ba_torchrl.envs.observations import OBSERVATIONS  # imports torch
+
+        parts += [(OBSERVATIONS, name) for name in config.observations]
     for registry, name in parts:
         module = registry.plugin_module(name)
         if module is not None:
             yield registry, name, module
 
 
-def _own_values(task_id: str, values: dict[str, Any], model: type[EnvConfig]) -> dict[str, Any]:
+def _own_values(task_id: str, values: Mapping[str, Any], model: type[EnvConfig]) -> dict[str, Any]:
     """Return the values without defaults of other tasks' parameters."""
     own = dict(values)
     for name in values.keys() - model.model_fields.keys():
@@ -206,7 +212,8 @@ def _own_values(task_id: str, values: dict[str, Any], model: type[EnvConfig]) ->
 
 
 def _with_defaults(task_class: type[Task], config: EnvConfig) -> EnvConfig:
-    """Return a configuration with the defaults of task and control in place of None."""
+    """Return a configuration with the defaults of task and control in place of None, which are not
+    among the fields that were set."""
     control, box = CONTROLS[task_class.control], task_class.workspace
     defaults = {
         "action_sequence": task_class.default_action_sequence or control.default_action_sequence,
@@ -220,7 +227,8 @@ def _with_defaults(task_class: type[Task], config: EnvConfig) -> EnvConfig:
         defaults["in_hand_mode"] = task_class.default_in_hand_mode
         defaults["in_hand_size"] = task_class.default_in_hand_size
     missing = {name: value for name, value in defaults.items() if getattr(config, name) is None}
-    return config.model_copy(update=missing)
+    given = config.model_fields_set - missing.keys()
+    return type(config).model_construct(given, **{**dict(config), **missing})
 
 
 def check_scales(task_id: str, scales: tuple[float, float]) -> None:

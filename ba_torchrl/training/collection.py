@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import pickle
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
@@ -34,7 +35,7 @@ def make_env(config: ExperimentConfig, seed: int, **changes: Any) -> EnvBase:
         changes: keywords of `make_vector_env`; by default, failed processes are waited for.
     """
     options = {"seed": seed, "wait_for_restarts": True, **changes}
-    return make_vector_env(config.resolved_env, config.num_envs, workers=config.workers, **options)
+    return make_vector_env(config.env, config.num_envs, workers=config.workers, **options)
 
 
 def start_collection(
@@ -44,34 +45,33 @@ def start_collection(
     positions: Sequence[EpisodePosition] | None,
 ) -> Collection:
     """Start the collector of a run; see `CollectorConfig.start`."""
-    values = config.model_dump(mode="json")  # which other processes read, plugins first
+    # by reference to the classes of this process's main module, which cloudpickle would copy
+    pickled = pickle.dumps(config)
     problem = CollectionProblem(
         learner=learner,
         device=config.torch_device,
         num_envs=config.num_envs,
         seed=seed,
-        make_env=partial(_make_some_envs, values, learner.config.imitates == "expert_everywhere"),
-        make_policy=partial(_make_policy, values),
+        make_env=partial(_make_some_envs, pickled, learner.config.imitates == "expert_everywhere"),
+        make_policy=partial(_make_policy, pickled),
         workers=config.workers,
     )
     return config.collector.start(problem, positions)
 
 
-def _make_some_envs(values: dict[str, Any], expert: bool, num_envs: int, seed: int) -> EnvBase:
-    shared_with_other_workers = num_envs < values["num_envs"]
-    if values["parallel"] is None and shared_with_other_workers:
-        values = {**values, "parallel": False}  # the workers are processes already
-    config = _read(values, num_envs=num_envs)
+def _make_some_envs(pickled: bytes, expert: bool, num_envs: int, seed: int) -> EnvBase:
+    config: ExperimentConfig = pickle.loads(pickled)
+    changes: dict[str, Any] = {"num_envs": num_envs}
+    if config.parallel is None and num_envs < config.num_envs:
+        changes["parallel"] = False  # the workers are processes already
+    config = config.model_copy(update=changes)
     labels = {"expert": expert, "expert_chunk": config.algorithm.expert_chunk}
     return make_env(config, seed, wait_for_restarts=config.wait_for_restarts, **labels)
 
 
-def _make_policy(values: dict[str, Any], seed: int) -> TensorDictModuleBase:
-    return build_learner(_read(values, device="cpu", seed=seed)).policy
-
-
-def _read(values: dict[str, Any], **changes: int | str) -> ExperimentConfig:
-    return ExperimentConfig.model_validate({**values, **changes})
+def _make_policy(pickled: bytes, seed: int) -> TensorDictModuleBase:
+    config: ExperimentConfig = pickle.loads(pickled)
+    return build_learner(config.model_copy(update={"device": "cpu", "seed": seed})).policy
 
 
 def gather_demonstrations(
@@ -88,7 +88,7 @@ def gather_demonstrations(
         episodes = load_demonstrations(
             config.demonstrations_path,
             task=config.task,
-            env=config.env,
+            env=config.env.given,
             mapping=config.demonstrations_mapping,
         )
         for name in ("demonstrations_noise", "demonstrations_turn_noise", "demonstrations_source"):
@@ -115,8 +115,8 @@ def gather_demonstrations(
             only_successful=config.only_successful_demonstrations,
             noise=config.demonstrations_noise,
             turn_noise=config.demonstrations_turn_noise,
-            turns=config.resolved_env.actions.turns,
-            primitive=config.resolved_env.actions.primitive,
+            turns=config.env.actions.turns,
+            primitive=config.env.actions.primitive,
             nearest_action=learner.nearest_action,
             on_episode=on_episode,
         )

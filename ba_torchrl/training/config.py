@@ -7,12 +7,17 @@ seconds; methods import what needs it.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
-from pydantic import Field, field_validator
+from pydantic import (
+    Field,
+    SerializationInfo,
+    ValidationInfo,
+    field_serializer,
+    field_validator,
+)
 
 from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS, LearnerConfig, NetworkConfig
 from ba_torchrl.core.config import (
@@ -29,7 +34,7 @@ from ba_torchrl.core.config import (
 from ba_torchrl.core.errors import ConfigError, PartError, install_command
 from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.core.seeds import SeedUse, derive_seed
-from ba_torchrl.envs.settings import ResolvedEnv, check_env, resolve_env
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.record.logging import Backend
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
 from ba_torchrl.training.collectors.config import COLLECTORS, CollectorConfig
@@ -53,8 +58,8 @@ class ExperimentConfig(WorkerOptions):
     robot, network, algorithm and collector."""
     task: str
     """Id of the task."""
-    env: dict[str, Any] = Field(default_factory=dict)
-    """Fields of `EnvConfig`."""
+    env: ResolvedEnv = Field(default={}, validate_default=True)
+    """Parameters of the task's environment, fields of `EnvConfig`."""
     algorithm: Annotated[LearnerConfig, Chosen(ALGORITHMS)]
     """``name`` of a registered algorithm and its hyper-parameters."""
     network: Annotated[NetworkConfig, Chosen(NETWORKS)]
@@ -144,15 +149,11 @@ class ExperimentConfig(WorkerOptions):
     benchmark: str | None = None
     """Name of the benchmark that the run belongs to, for reports."""
 
-    @cached_property
-    def resolved_env(self) -> ResolvedEnv:
-        """The environments' task and parameters."""
-        return resolve_env(self.task, self.env, "env", self.plugins)
-
     @property
     def workers(self) -> WorkerOptions:
         """How the processes of environments start and are replaced."""
-        return WorkerOptions(**{name: getattr(self, name) for name in WorkerOptions.model_fields})
+        names = WorkerOptions.model_fields
+        return WorkerOptions.model_construct(**{name: getattr(self, name) for name in names})
 
     def derived_seed(self, use: SeedUse, part: int = 0) -> int:
         """Return the first seed of the environments that serve ``use``.
@@ -169,7 +170,7 @@ class ExperimentConfig(WorkerOptions):
         values, unset = self.model_dump(mode="json"), set(SET_BY_THE_EXPERIMENT)
         for name in self.collector.resources:
             values["collector"].pop(name, None)
-        return {**values, "env": self.resolved_env.config.model_dump(mode="json", exclude=unset)}
+        return {**values, "env": self.env.config.model_dump(mode="json", exclude=unset)}
 
     @property
     def torch_device(self) -> torch.device:
@@ -196,15 +197,11 @@ class ExperimentConfig(WorkerOptions):
             ConfigError: a name is unknown, a type wrong, or parts do not go together.
         """
         config = parse(cls, _without_replaced(values, given), what)
-        for reserved in SET_BY_THE_EXPERIMENT:
-            if reserved in config.env:
-                raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
-        check_env(config.task, config.env, "env")
         config.collector.check(config.num_envs)
-        if config.resolved_env.config.obs_type != "pixel":
+        if config.env.config.obs_type != "pixel":
             raise ConfigError("env.obs_type: the networks take images; leave it at 'pixel'")
         algorithm = config.algorithm
-        algorithm.check(config.network, config.resolved_env.task_class.control)
+        algorithm.check(config.network, config.env.task_class.control)
         config._check_reward()
         own, further = algorithm.first_updates, config.pretrain_updates
         total = config.total_updates
@@ -247,6 +244,28 @@ class ExperimentConfig(WorkerOptions):
             raise InnerError(error) from error
         return names
 
+    @field_validator("env", mode="plain")
+    @classmethod
+    def _resolve(cls, values: Any, info: ValidationInfo) -> ResolvedEnv | None:
+        if not isinstance(values, Mapping):
+            raise ValueError("Input should be a valid dictionary")
+        if "task" not in info.data:
+            return None  # the task's error is the one to report
+        try:
+            for reserved in SET_BY_THE_EXPERIMENT:
+                if reserved in values:
+                    raise ConfigError(f"env.{reserved} is set by the experiment; leave it out")
+            return resolve_env(info.data["task"], values, "env", info.data.get("plugins", ()))
+        except ConfigError as error:
+            raise InnerError(error) from error
+
+    @field_serializer("env")
+    def _given(self, env: ResolvedEnv, info: SerializationInfo) -> dict[str, Any]:
+        return env.config.model_dump(mode=info.mode, exclude_unset=True)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _blank, (type(self), self.plugins), self.__getstate__()
+
     def _all_plugins(self) -> list[str]:
         """Return `plugins` and the modules that register what the run uses, each once."""
         modules = (
@@ -254,10 +273,10 @@ class ExperimentConfig(WorkerOptions):
             for kind, registry in _REGISTRIES.items()
         )
         found = [name for name in modules if name is not None and name not in MAIN]
-        return list(dict.fromkeys([*self.resolved_env.modules, *found]))
+        return list(dict.fromkeys([*self.env.modules, *found]))
 
     def _check_reward(self) -> None:
-        env, gamma = self.resolved_env.config, getattr(self.algorithm, "gamma", None)
+        env, gamma = self.env.config, getattr(self.algorithm, "gamma", None)
         if env.reward == "difference" and gamma not in (None, env.reward_discount):
             raise ConfigError(
                 f"env.reward_discount: {env.reward_discount:g} must equal algorithm.gamma, "
@@ -277,7 +296,7 @@ class ExperimentConfig(WorkerOptions):
         check_turn_noise(
             self.demonstrations_turn_noise,
             self.demonstrations_source,
-            self.resolved_env.actions.turns,
+            self.env.actions.turns,
             "demonstrations_turn_noise",
         )
         if self.demonstrations and self.demonstrations_source == "deconstruction":
@@ -288,12 +307,18 @@ class ExperimentConfig(WorkerOptions):
             check_demonstrations(
                 self.demonstrations_path,
                 task=self.task,
-                env=self.env,
+                env=self.env.given,
                 least=self.demonstrations,
                 mapping=self.demonstrations_mapping,
             )
         elif self.demonstrations_mapping is not None:
             raise ConfigError("demonstrations_mapping: set demonstrations_path, whose it is")
+
+
+def _blank(model: type[ExperimentConfig], plugins: Collection[str]) -> ExperimentConfig:
+    """Import plugins, and return what gets its fields from a pickle."""
+    load_plugins(plugins)
+    return model.__new__(model)
 
 
 def usable_device(name: str) -> torch.device:

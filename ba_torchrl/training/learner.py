@@ -40,15 +40,15 @@ def _build(config: ExperimentConfig, problem: Problem) -> Learner:
 
 def problem_of(config: ExperimentConfig) -> Problem:
     """Return what the learner of an experiment must know of its environment."""
-    env = make(config.resolved_env)
+    env = make(config.env)
     env.close()
-    task_class = config.resolved_env.task_class
+    task_class = config.env.task_class
     return Problem(
         control=task_class.control,
         equal_moves=getattr(task_class, "equal_moves", 0),
         images=env.images,
         vectors=env.vectors,
-        center_m=config.resolved_env.workspace.center,
+        center_m=config.env.workspace.center,
         actions=env.actions,
         total_updates=config.total_updates,
         seed=config.seed,

@@ -58,8 +58,8 @@ def record_video(config: ExperimentConfig, policy: Policy) -> Path | None:
     """Record greedy episodes; return the file, None if the run wants no video."""
     if not config.video_episodes:
         return None
-    frames = record_episodes(config.resolved_env, policy, config.video_episodes, test_seed(0))
-    return write_video(config.folder / "evaluation.mp4", frames, fps=config.resolved_env.video_fps)
+    frames = record_episodes(config.env, policy, config.video_episodes, test_seed(0))
+    return write_video(config.folder / "evaluation.mp4", frames, fps=config.env.video_fps)
 
 
 def write_run_result(
@@ -77,7 +77,7 @@ def write_run_result(
         best: test of the checkpoint with the best evaluation.
         files: the run's other files by name; None for one that was not written.
     """
-    folder, task = config.folder.resolve(), config.resolved_env.task_class
+    folder, task = config.folder.resolve(), config.env.task_class
     result = RunResult(
         protocol=PROTOCOL,
         task=config.task,
@@ -117,7 +117,7 @@ def expert_version(config: ExperimentConfig) -> int | None:
 
     None if there is none, and of demonstrations that do not name it.
     """
-    present = config.resolved_env.task_class.expert_version
+    present = config.env.task_class.expert_version
     if config.algorithm.imitates == "expert_everywhere":
         return present
     if config.demonstrations and config.demonstrations_path is not None:

@@ -131,7 +131,7 @@ class TrainedPolicy(TensorDictModuleBase):
         usual = resolve_env(self.task, {}).config
         return {
             name: value
-            for name, value in self.config.resolved_env.config
+            for name, value in self.config.env.config
             if value != getattr(usual, name) and name not in SET_BY_THE_EXPERIMENT
         }
 
@@ -159,7 +159,7 @@ class TrainedPolicy(TensorDictModuleBase):
         self._check_observed(self.shapes, observed)
         while isinstance(env, TransformedEnv):
             env = env.base_env
-        here, trained = vars(env).get("resolved"), self.config.resolved_env
+        here, trained = vars(env).get("resolved"), self.config.env
         if here is None:
             return
         if here.actions != trained.actions:

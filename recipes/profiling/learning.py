@@ -13,7 +13,7 @@ from tensordict import TensorDict
 from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
-from ba_torchrl import make_vector_env
+from ba_torchrl import ResolvedEnv, make_vector_env
 from ba_torchrl.algorithms.acting import constant_weights
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.algorithms.problem import network_dtype
@@ -82,7 +82,7 @@ def _config(
 
 
 def _expert_episodes(
-    task: str, episodes: int, settings: dict[str, Any]
+    task: str | ResolvedEnv, episodes: int, settings: dict[str, Any]
 ) -> tuple[float, list[TensorDict]]:
     """Return the image's largest value and the expert's episodes."""
     env = make_vector_env(task, 1, parallel=False, seed=SEED, expert=True, **settings)
@@ -107,7 +107,7 @@ def make_learner(
     """
     config = _config(bench, experiment, network, obs_size)
     learner = build_learner(config)
-    learner.on_demonstrations(_expert_episodes(config.task, 20, config.env)[1])
+    learner.on_demonstrations(_expert_episodes(config.env, 20, {})[1])
     return learner
 
 
@@ -242,7 +242,7 @@ def measure_acting(bench: Bench, work: str) -> list[Row]:
     """Greedy actions of five environments, with filters expanded in every pass and once."""
     experiment, network, obs_size = ACTING[work]
     config = _config(bench, experiment, network, obs_size)
-    env = make_vector_env(config.task, 5, parallel=False, seed=SEED, **config.env)
+    env = make_vector_env(config.env, 5, parallel=False, seed=SEED)
     state = env.reset()
     env.close()
     act = acting_on(build_learner(config).policy, bench.device)

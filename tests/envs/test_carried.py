@@ -78,7 +78,7 @@ def test_collected_episodes_keep_them(policy):
 def test_a_trained_policy_passes_them_on(policy, wrapped):
     resolved = resolve_env(TASK, SMALL)
     learner = SimpleNamespace(policy=wrapped(policy), images={}, vectors={})
-    config = SimpleNamespace(task=TASK, resolved_env=resolved)
+    config = SimpleNamespace(task=TASK, env=resolved)
     trained = TrainedPolicy(learner, config, 0, Path("runs"), versions_of(TASK))
     env = ba_torchrl.make(resolved)
     assert env.rollout(5, trained)[COUNT].flatten().tolist() == list(range(5))

@@ -1,7 +1,7 @@
 """A process killed at random moments and resumed ends with the bits of an undisturbed one."""
 
-import json
 import os
+import pickle
 import random
 import signal
 import time
@@ -19,7 +19,7 @@ SETTINGS = {**SAC, "parallel": True, "start_method": "fork", "save_minutes": 0.0
 CODE = """
 import os, sys
 os.setsid()
-sys.stdin = open("config.json")
+sys.stdin = open("config.pkl")
 from ba_torchrl.training.grid.run_one import main
 main()
 """
@@ -27,8 +27,8 @@ main()
 
 def start(folder, **changes):
     """The process of a run, which leads a group of its own; its files are beside the run."""
-    values = {**SETTINGS, **changes, "run_dir": str(folder), "resume": True}
-    (folder.parent / "config.json").write_text(json.dumps(values))
+    config = config_for(folder, {**SETTINGS, **changes, "resume": True})
+    (folder.parent / "config.pkl").write_bytes(pickle.dumps(config))
     return script(folder.parent, CODE)
 
 

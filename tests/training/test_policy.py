@@ -64,7 +64,7 @@ def test_the_policy_of_a_run_is_greedy_and_has_no_gradient(run):
     torch.testing.assert_close(first["action"], second["action"], rtol=0, atol=0)
     config, _ = load_checkpoint(run)
     env = policy.make_env()
-    assert env.config.model_copy(update={"seed": None}) == config.resolved_env.config
+    assert env.config.model_copy(update={"seed": None}) == config.env.config
     env.rollout(2, policy)
     env.close()
 

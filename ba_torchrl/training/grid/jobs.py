@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import pickle
 import signal
 import subprocess
 import sys
@@ -52,7 +53,8 @@ def run_all(
         jobs: number of runs at the same time.
         max_hours: time limit of each run.
         progress: show a progress bar over the runs.
-        worker: command that reads a run's configuration as JSON from its standard input.
+        worker: command that reads a run's pickled configuration from its standard input; its
+            argument is the run's folder, so that lists of processes name it.
 
     Returns:
         By run folder, the reason of its failure. Runs that another process runs are left to it.
@@ -143,16 +145,15 @@ class _Job:
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
         with (run.folder / LOG_FILE).open("a") as log:
             self._process = subprocess.Popen(
-                worker,
+                [*worker, str(run.folder)],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,
-                text=True,
                 start_new_session=True,  # a group that is ended as a whole, with its environments
             )
         try:
             with self._process.stdin as stdin:
-                stdin.write(run.model_dump_json())
+                pickle.dump(run, stdin)
         except BrokenPipeError:
             pass  # it ended before it read; its exit status is the reason
 

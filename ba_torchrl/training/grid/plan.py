@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import functools
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
@@ -302,10 +301,10 @@ def _check_parts(runs: Sequence[ExperimentConfig]) -> None:
 
     from ba_torchrl.training.learner import build_learner, problem_of
 
-    problems: dict[tuple[str, str], Problem] = {}
+    problems: dict[str, Problem] = {}
     built = set()
     for run in runs:
-        key = (run.task, json.dumps(run.env, sort_keys=True))
+        key = repr(run.env)
         try:
             if key not in problems:
                 problem = problem_of(run)

@@ -1,4 +1,4 @@
-"""One run of a benchmark; the process reads its configuration as JSON from the standard input.
+"""One run of a benchmark; the process reads its pickled configuration from the standard input.
 
 Environments in processes of their own import this module again, so everything else is imported
 where it is needed.
@@ -13,23 +13,22 @@ def main() -> None:
 
     import sys
 
-    run_experiment(sys.stdin.read())
+    run_experiment(sys.stdin.buffer.read())
 
 
-def run_experiment(values: str) -> None:
-    """Run an experiment in this process."""
-    import json
+def run_experiment(pickled: bytes) -> None:
+    """Run an experiment, an `ExperimentConfig`, in this process."""
     import logging
+    import pickle
 
     from ba_torchrl.record.logging import limit_library_logs
-    from ba_torchrl.training.config import ExperimentConfig
     from ba_torchrl.training.experiment import Experiment
     from ba_torchrl.training.interruption import RunStopped
 
     logging.basicConfig(level=logging.INFO)
     limit_library_logs()
     try:
-        Experiment(ExperimentConfig.parse(json.loads(values)), progress=False).run()
+        Experiment(pickle.loads(pickled), progress=False).run()
     except RunStopped as stopped:
         logging.getLogger(__name__).warning("%s", stopped)
         raise

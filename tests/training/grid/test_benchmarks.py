@@ -95,7 +95,7 @@ def test_overrides_make_a_small_budget():
         "folder=somewhere",
     )
     cnn, equi = runs
-    assert (cnn.total_updates, cnn.resolved_env.config.obs_size) == (600, 64)
+    assert (cnn.total_updates, cnn.env.config.obs_size) == (600, 64)
     assert cnn.network.width == 0.5
     assert {run.network.depth_scale_m for run in runs} == {0.1}
     assert {run.algorithm.tau for run in runs} == {0.05}

@@ -26,11 +26,11 @@ from tests.training.test_resume import interrupt
 
 FAKE_WORKER = """
 import json, os, pathlib, signal, sys, time
-config = json.load(sys.stdin)
-folder = pathlib.Path(config["run_dir"])
+folder = pathlib.Path(sys.argv[1])
+seed = folder.name.removeprefix("seed")
 (folder / "calls").open("a").write("x")
-print("seed", config["seed"], "runs", flush=True)
-orders = folder.parents[2] / f"orders-{config['seed']}"
+print("seed", seed, "runs", flush=True)
+orders = folder.parents[2] / f"orders-{seed}"
 order = orders.read_text() if orders.exists() else "finish"
 if order == "fail":
     sys.exit("it broke")
@@ -55,7 +55,7 @@ if order == "meet":  # needs another one at the same time
     else:
         sys.exit("the other run did not start")
 results = json.loads((folder.parents[2] / "results.json").read_text())
-(folder / "result.json").write_text(results[config["run_dir"]])
+(folder / "result.json").write_text(results[str(folder)])
 """
 
 
@@ -200,15 +200,14 @@ def test_an_interruption_ends_the_running_jobs(tmp_path, fake, monkeypatch, caps
 
 
 SLOW_TO_SAVE = """
-import json, pathlib, signal, sys, time
-config = json.load(sys.stdin)
-folder = pathlib.Path(config["run_dir"])
+import pathlib, signal, sys, time
+folder = pathlib.Path(sys.argv[1])
 asked = []
 signal.signal(signal.SIGTERM, lambda *_: asked.append(0))
 (folder / "calls").write_text("x")
 while not asked:
     time.sleep(0.05)
-time.sleep(0.5 + 0.5 * config["seed"])
+time.sleep(0.5 + 0.5 * (folder.name == "seed1"))
 (folder / "asked").write_text(str(len(asked)))
 """
 

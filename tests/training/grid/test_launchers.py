@@ -59,7 +59,7 @@ def test_a_task_stops_at_its_time_limit_with_its_state_saved(tmp_path, monkeypat
 
     monkeypatch.setattr(ray_launcher, "run_experiment", run_until_stopped)
     with pytest.raises(TimeoutError, match=r"max_hours.*SIGTERM, state saved"):
-        ray_launcher._run_in_task(run.model_dump_json(), max_hours=1e-4)
+        ray_launcher._run_in_task(run.folder, b"", max_hours=1e-4)
     assert (run.folder / "run.log").exists()
 
 
@@ -78,7 +78,7 @@ def test_a_task_leaves_no_semaphore_whose_tracker_ray_ends(tmp_path, monkeypatch
     for owner, name in ((tqdm, "_lock"), (TqdmDefaultWriteLock, "mp_lock")):
         monkeypatch.delattr(owner, name, raising=False)
     monkeypatch.setattr(ray_launcher, "run_experiment", experiment)
-    ray_launcher._run_in_task(run.model_dump_json(), max_hours=None)
+    ray_launcher._run_in_task(run.folder, b"", max_hours=None)
     assert left[0]() is None
     assert not hasattr(TqdmDefaultWriteLock, "mp_lock")
 

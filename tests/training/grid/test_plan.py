@@ -44,8 +44,8 @@ def test_the_more_specific_override_wins(tmp_path):
     assert demonstrations[PICK, "sacfd cnn"] == 4
     assert demonstrations[PICK, "sacfd small"] == 5
     pick = by[PICK, "sacfd small"]
-    assert pick.env == {"obs_size": 64, "max_steps": 9}
-    assert by[REACH, "sacfd small"].env == {"obs_size": 64, "max_steps": 8}
+    assert pick.env.given == {"obs_size": 64, "max_steps": 9}
+    assert by[REACH, "sacfd small"].env.given == {"obs_size": 64, "max_steps": 8}
     assert (pick.algorithm.gamma, pick.algorithm.batch_size) == (0.9, 8)
     assert by[PICK, "sac small"].algorithm.gamma == 0.99
     assert (pick.network.width, pick.network.depth_scale_m) == (0.5, 0.1)

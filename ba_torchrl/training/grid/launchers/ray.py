@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import logging
 import os
+import pickle
 import signal
 import threading
 from pathlib import Path
@@ -13,7 +14,6 @@ from typing import Any
 from tqdm import tqdm
 
 from ba_torchrl.record.results import FAILURE_FILE
-from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.grid.jobs import LOG_FILE, SAVE_S, record_failure, unfinished
 from ba_torchrl.training.grid.launchers.base import Grid
 from ba_torchrl.training.grid.launchers.ray_config import RayLauncherConfig
@@ -39,8 +39,8 @@ def run_all(config: RayLauncherConfig, grid: Grid) -> dict[Path, str]:
     for run in waiting:
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
         where = {"run_dir": str(run.folder.resolve())}
-        values = run.model_copy(update=where).model_dump_json()
-        pending[task.remote(values, grid.max_hours)] = run
+        pickled = pickle.dumps(run.model_copy(update=where))
+        pending[task.remote(run.folder.resolve(), pickled, grid.max_hours)] = run
     failures: dict[Path, str] = {}
     bar = tqdm(total=len(grid.runs), initial=len(grid.runs) - len(waiting), unit="run")
     try:
@@ -74,14 +74,13 @@ def _reason(reference: Any) -> str | None:
     return None
 
 
-def _run_in_task(values: str, max_hours: float | None) -> None:
-    """Run an experiment in this process, with the run folder's log file.
+def _run_in_task(folder: Path, pickled: bytes, max_hours: float | None) -> None:
+    """Run an experiment in this process, with the log file of its folder.
 
     Ray ends the child processes of this one before the exit of Python, among them the tracker of
     semaphores. Those that exist until then would be reported as lost, so none does.
     """
     tqdm.set_lock(threading.RLock())  # in place of a semaphore
-    folder = Path(ExperimentConfig.model_validate_json(values).run_dir)
     folder.mkdir(parents=True, exist_ok=True)
     handler = logging.FileHandler(folder / LOG_FILE)
     logging.getLogger().addHandler(handler)
@@ -90,7 +89,7 @@ def _run_in_task(values: str, max_hours: float | None) -> None:
     timer.daemon = True
     timer.start()
     try:
-        run_experiment(values)
+        run_experiment(pickled)
     except RunStopped as stopped:  # a task that raises SystemExit is repeated
         raise TimeoutError(f"took longer than max_hours, or was cancelled: {stopped}") from None
     except Exception:
