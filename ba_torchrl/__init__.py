@@ -8,43 +8,15 @@ from ba_torchrl.core.lazy import lazy_names
 from ba_torchrl.envs.registration import register_with_gymnasium
 
 if TYPE_CHECKING:
-    from ba_torchrl.core.config import WorkerOptions
-    from ba_torchrl.core.env_config import EnvConfig
-    from ba_torchrl.envs.base import BulletArmEnv
-    from ba_torchrl.envs.description import describe
-    from ba_torchrl.envs.factory import make, make_vector_env
-    from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
-    from ba_torchrl.training.policy import load_policy
+    from ba_torchrl.core.config import WorkerOptions as WorkerOptions
+    from ba_torchrl.core.env_config import EnvConfig as EnvConfig
+    from ba_torchrl.envs.base import BulletArmEnv as BulletArmEnv
+    from ba_torchrl.envs.description import describe as describe
+    from ba_torchrl.envs.factory import make as make, make_vector_env as make_vector_env
+    from ba_torchrl.envs.settings import ResolvedEnv as ResolvedEnv, resolve_env as resolve_env
+    from ba_torchrl.training.policy import load_policy as load_policy
 
 __version__ = "0.1.0"
-
-_MODULES = {
-    "BulletArmEnv": "envs.base",
-    "EnvConfig": "core.env_config",
-    "ResolvedEnv": "envs.settings",
-    "WorkerOptions": "core.config",
-    "describe": "envs.description",
-    "load_policy": "training.policy",
-    "make": "envs.factory",
-    "make_vector_env": "envs.factory",
-    "resolve_env": "envs.settings",
-}
-"""Modules of the public names, imported at their first use: TorchRL takes seconds."""
-
-__all__ = [
-    "BulletArmEnv",
-    "EnvConfig",
-    "ResolvedEnv",
-    "WorkerOptions",
-    "__version__",
-    "describe",
-    "list_robots",
-    "list_tasks",
-    "load_policy",
-    "make",
-    "make_vector_env",
-    "resolve_env",
-]
 
 register_with_gymnasium()
 
@@ -63,4 +35,4 @@ def list_robots() -> list[str]:
     return list(ROBOTS)
 
 
-__getattr__, __dir__ = lazy_names(__name__, _MODULES, __all__)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -20,13 +20,14 @@ from sphinx.util import logging
 
 from ba_torchrl import __version__, list_tasks
 from ba_torchrl.algorithms.base import ALGORITHMS
+from ba_torchrl.core.config import descriptions
 from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.envs.description import describe, expert_scores, summary, tasks_by_heading
 from ba_torchrl.modules.base import NETWORKS
-from ba_torchrl.record.results import read_result, shipped_file
+from ba_torchrl.record.results import read_result, shipped_file, shipped_policies
 from ba_torchrl.record.statistics import wilson
 from ba_torchrl.training.config import ExperimentConfig
-from ba_torchrl.training.policy import evaluate_command, shipped_policies
+from ba_torchrl.training.policy import evaluate_command
 from docs.notebook import markdown, notebook
 
 project, author, release = "BA-TorchRL", "The BA-TorchRL authors", __version__
@@ -233,13 +234,14 @@ def fields_page() -> str:
 
 def _rows(model: type[BaseModel]) -> Iterable[str]:
     """Yield a row of a table for each field."""
+    texts = descriptions(model)
     for name, field in model.model_fields.items():
         default: Any = (
             "required"
             if field.is_required()
             else f"`{field.get_default(call_default_factory=True)!r}`"
         )
-        yield f"| `{name}` | {_cell(default)} | {_cell(field.description or '')} |"
+        yield f"| `{name}` | {_cell(default)} | {_cell(texts.get(name, ''))} |"
 
 
 def _slug(task: str) -> str:

@@ -36,10 +36,10 @@ from ba_torchrl.demonstrations.time_reversal import make_deconstruction_env
 from ba_torchrl.envs.description import tasks_by_heading
 from ba_torchrl.envs.policies import expert_policy
 from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.record.results import shipped_policies
 from ba_torchrl.record.video import FrameRecorder
 from ba_torchrl.tasks.structures.open_loop import check_has_structure
 from ba_torchrl.training.evaluation import record_episodes
-from ba_torchrl.training.policy import shipped_policies
 
 STILL = 240
 """Width of the picture of a task, in pixels."""

@@ -13,7 +13,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from ba_torchrl.cli import PROGRAM
-from ba_torchrl.core.config import Part, defaults_of, parts_of
+from ba_torchrl.core.config import Part, defaults_of, descriptions, parts_of
 from ba_torchrl.core.env_config import EnvConfig, env_config_model
 from ba_torchrl.core.registry import Registry
 from ba_torchrl.demonstrations.formats.base import FORMATS
@@ -68,9 +68,10 @@ def describe(
         if not model.model_fields:
             continue
         lines += ["", f"{title}:"]
+        texts = descriptions(model)
         for name, field in model.model_fields.items():
             if (name in own or field.is_required()) and f"{prefix}{name}." not in expanded:
-                lines += _field(f"{prefix}{name}", field, own.get(name))
+                lines += _field(f"{prefix}{name}", field, own.get(name), texts.get(name, ""))
     return "\n".join(lines)
 
 
@@ -94,42 +95,41 @@ def _parts(
             yield f"{group}={chosen['name']}", model, {**defaults_of(model), **chosen}, f"{group}."
 
 
-def _field(name: str, field: FieldInfo, value: Any) -> list[str]:
+def _field(name: str, field: FieldInfo, value: Any, text: str) -> list[str]:
     parts = parts_of(field.annotation)
     if isinstance(field.default, Part) and isinstance(value, Mapping):
         value = {"name": field.default.name, **value}
     if parts and isinstance(value, Mapping) and value.get("name", "") in parts:
-        return _part(name, field, parts, value)
+        return _part(name, parts, value, text)
     shown = name
     if not field.is_required() or value not in (None, "???"):
         shown = f"{name}={_short(value)}"
         shown = f"'{shown}'" if isinstance(value, list | tuple | dict) else shown  # for zsh
     choices = _choices(name.split(".")[-1], field.annotation)
     lines = [f"  {shown}" + (f"   {{{', '.join(choices)}}}" if choices else "")]
-    return lines + _description(field)
+    return lines + _first_sentence(text)
 
 
-def _description(field: FieldInfo) -> list[str]:
-    """Return the first sentence of a field's description."""
-    if not field.description:
+def _first_sentence(text: str) -> list[str]:
+    if not text:
         return []
-    text = " ".join(field.description.replace("`", "").split())
+    text = " ".join(text.replace("`", "").split())
     first = re.split(r"(?<=[^ ]{2}\.) (?=[A-Z\"])", text)[0]
     return _wrapped(" " * _INDENT, first)
 
 
 def _part(
-    name: str, field: FieldInfo, parts: Mapping[str, type[BaseModel]], value: Mapping[str, Any]
+    name: str, parts: Mapping[str, type[BaseModel]], value: Mapping[str, Any], text: str
 ) -> list[str]:
     """Return the lines of a field that has fields of its own, those of its choice."""
     chosen, lines = value.get("name", ""), []
     if chosen:
         lines = [f"  {name}.name={chosen}   {{{', '.join(parts)}}}"]
-        lines += _description(field)
-    own = {**defaults_of(parts[chosen]), **value}
+        lines += _first_sentence(text)
+    own, texts = {**defaults_of(parts[chosen]), **value}, descriptions(parts[chosen])
     for each, inner in parts[chosen].model_fields.items():
         if each != "name":
-            lines += _field(f"{name}.{each}", inner, own[each])
+            lines += _field(f"{name}.{each}", inner, own[each], texts.get(each, ""))
     return lines
 
 

@@ -5,13 +5,14 @@ ba-torchrl doctor
 
 from __future__ import annotations
 
-import importlib
 import os
 import platform
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
+from importlib.machinery import PathFinder
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import find_spec, module_from_spec
 
 from ba_torchrl import __version__
 from ba_torchrl.cli import EXIT_CODE, OF_TRAINING, config_dir
@@ -96,9 +97,9 @@ def _cpu() -> str:
 def _cpu_path() -> str:
     import torch
 
-    from ba_torchrl.modules.layers import compute_dtype
+    from ba_torchrl.core.hardware import bfloat16_is_fast
 
-    kind = str(compute_dtype("auto", torch.device("cpu"))).removeprefix("torch.")
+    kind = "bfloat16" if bfloat16_is_fast() else "float32"
     return f"{kind} ({torch.backends.cpu.get_cpu_capability()})"
 
 
@@ -111,15 +112,24 @@ def _gpu() -> str:
 
 
 def _native_trees() -> str:
+    import torch  # noqa: F401 -- the library that the trees are linked to
+
+    name, package = "torchrl._torchrl", find_spec("torchrl")
+    if package is None:
+        raise ModuleNotFoundError("No module named 'torchrl'", name="torchrl")
     try:
-        importlib.import_module("torchrl._torchrl")
+        if name not in sys.modules:  # the file alone: TorchRL's own import takes seconds
+            spec = PathFinder.find_spec(name, package.submodule_search_locations)
+            if spec is None:
+                raise ImportError
+            module_from_spec(spec)
     except ImportError:
         return "trees in Python: TorchRL's do not fit this torch"
     return "TorchRL's native trees"
 
 
 def _policies() -> str:
-    from ba_torchrl.training.policy import shipped_policies
+    from ba_torchrl.record.results import shipped_policies
 
     return ", ".join(shipped_policies()) or "none"
 

@@ -30,7 +30,6 @@ def _capabilities() -> dict[str, Any]:
     return dict(getattr(torch.cpu, "get_capabilities", dict)())
 
 
-@torch.compiler.assume_constant_result
 def amx_is_used() -> bool:
     """Return whether the processor has AMX and oneDNN may use it."""
     allowed = onednn_max_cpu_isa()
@@ -38,7 +37,6 @@ def amx_is_used() -> bool:
     return has_amx and (allowed is None or "AMX" in allowed)
 
 
-@torch.compiler.assume_constant_result
 def bfloat16_is_fast() -> bool:
     """Return whether the processor multiplies bfloat16 faster than float32.
 

@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 from ba_torchrl.core.lazy import lazy_names
 
 if TYPE_CHECKING:
-    from ba_torchrl.envs.base import BulletArmEnv
+    from ba_torchrl.envs.base import BulletArmEnv as BulletArmEnv
 
-__all__ = ["BulletArmEnv"]
 
-__getattr__, __dir__ = lazy_names(__name__, {"BulletArmEnv": "base"}, __all__)
+__getattr__, __dir__, __all__ = lazy_names(__name__)

@@ -10,6 +10,7 @@ from functools import cache
 from importlib.resources import files
 from typing import Any
 
+from ba_torchrl.core.config import descriptions
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
 
 EXPERT_SCORES = "expert_scores.json"
@@ -132,6 +133,7 @@ def describe(task: str) -> TaskDescription:
         config = env.config
     finally:
         env.close()
+    texts = descriptions(cls.Parameters)
     least, most = cls.num_objects_range
     positions = "positions and yaws" if config.random_orientation else "positions"
     scales = config.object_scale_range
@@ -150,7 +152,7 @@ def describe(task: str) -> TaskDescription:
         object_scale_range=scales,
         object_scale_limits=cls.scale_limits,
         parameters={
-            name: (field.default, " ".join((field.description or "").split()))
+            name: (field.default, " ".join(texts.get(name, "").split()))
             for name, field in cls.Parameters.model_fields.items()
         },
         experts=expert_scores().get(task, {}),

@@ -17,6 +17,9 @@ from ba_torchrl.core.choices import Precision
 
 Value = TypeVar("Value")
 
+for _constant in (hardware.amx_is_used, hardware.bfloat16_is_fast):
+    torch.compiler.assume_constant_result(_constant)  # here, since it imports torch's compiler
+
 
 def real_tensors(function: Callable[..., Value]) -> Callable[..., Value]:
     """Decorate a function whose tensors are for the whole process.

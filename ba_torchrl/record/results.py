@@ -285,6 +285,12 @@ def shipped_file(task: str) -> Path:
     return POLICIES / f"{task}{POLICY_SUFFIX}"
 
 
+def shipped_policies() -> list[str]:
+    """Return the tasks of which the package ships a policy."""
+    files = POLICIES.rglob(f"*{POLICY_SUFFIX}")
+    return sorted(file.relative_to(POLICIES).with_suffix("").as_posix() for file in files)
+
+
 def file_of(folder: Path, result: RunResult, name: str) -> Path | None:
     """Return a file of a run by its name in the result; None if the run has no such file, or one
     that a link leads out of the run folder to."""

@@ -16,8 +16,7 @@ from typing import Any, Literal
 import torch
 from pydantic import BaseModel, ValidationError
 from safetensors import SafetensorError
-from safetensors.torch import load as load_tensors
-from safetensors.torch import save as save_tensors
+from safetensors.torch import load as load_tensors, save as save_tensors
 from tensordict import TensorDictBase
 from tensordict.nn import TensorDictModuleBase
 from tensordict.utils import NestedKey
@@ -44,6 +43,7 @@ from ba_torchrl.record.results import (
     now,
     read_result,
     shipped_file,
+    shipped_policies,
     versions,
 )
 from ba_torchrl.tasks.base import TASKS, Versions, versions_of
@@ -410,8 +410,3 @@ def evaluate_command(source: str | Path, result: RunResult) -> str:
     if plugins := result.config.get("plugins"):
         words.append(f"plugins=[{','.join(plugins)}]")
     return shlex.join(["ba-torchrl", "evaluate", *words])
-
-
-def shipped_policies() -> list[str]:
-    """Return the tasks for which the package ships a policy."""
-    return [task for task in TASKS if shipped_file(task).exists()]

@@ -16,8 +16,7 @@ from torchrl.envs import EnvBase
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.algorithms.acting import constant_weights
-from ba_torchrl.core.config import FIRST_TEST_SEED
-from ba_torchrl.core.config import PROTOCOL as PROTOCOL
+from ba_torchrl.core.config import FIRST_TEST_SEED, PROTOCOL as PROTOCOL
 from ba_torchrl.demonstrations.episodes import is_success, play_seeds
 from ba_torchrl.envs.checks import check_policy
 from ba_torchrl.envs.policies import Policy

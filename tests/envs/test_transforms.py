@@ -4,8 +4,7 @@ import contextlib
 
 import pytest
 import torch
-from torchrl.envs import GymEnv, TransformedEnv
-from torchrl.envs import transforms as tr
+from torchrl.envs import GymEnv, TransformedEnv, transforms as tr
 from torchrl.envs.utils import check_env_specs
 from torchrl.record import PixelRenderTransform
 

@@ -1,8 +1,7 @@
 """Strategies of values, and the number of examples of each property."""
 
 import pytest
-from hypothesis import HealthCheck, Phase, given, settings
-from hypothesis import strategies as st
+from hypothesis import HealthCheck, Phase, given, settings, strategies as st
 
 MANY = 2000
 

@@ -7,8 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from ba_torchrl.modules.steerable import cpu_threads
-from ba_torchrl.modules.steerable import irrep_convolution as chunked
+from ba_torchrl.modules.steerable import cpu_threads, irrep_convolution as chunked
 from ba_torchrl.modules.steerable.irrep_convolution import irrep_convolution, saves_time
 from ba_torchrl.modules.steerable.kernels import kernel_block, regular_irrep_kernels
 from ba_torchrl.modules.steerable.layers import SteerableConv2d, reuse_filters

@@ -9,8 +9,7 @@ from torch import nn
 from ba_torchrl.modules import layers
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.layers import compute_dtype
-from tests.modules.networks import ACTOR_CRITICS, SPATIAL, count, spatial
-from tests.modules.networks import actor_critic as small
+from tests.modules.networks import ACTOR_CRITICS, SPATIAL, actor_critic as small, count, spatial
 from tests.specs import actor_critic_spec
 
 

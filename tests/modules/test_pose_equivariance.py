@@ -3,8 +3,7 @@
 import pytest
 import torch
 
-from tests.modules.networks import pose, train, turned_pixels, values_of
-from tests.modules.networks import pose_batch as batch
+from tests.modules.networks import pose, pose_batch as batch, train, turned_pixels, values_of
 from tests.tasks.episodes import slow
 
 SIZE = 64

@@ -11,9 +11,7 @@ from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.base import scaled_heights, scaled_in_hand
 from ba_torchrl.modules.spatial.pose_values import PoseValues, SceneMapVector
 from ba_torchrl.sim.vision.in_hand import IN_HAND_MODES, PickView, crop
-from tests.modules.networks import COUNTS, POSE, count
-from tests.modules.networks import pose as build
-from tests.modules.networks import pose_batch as batch
+from tests.modules.networks import COUNTS, POSE, count, pose as build, pose_batch as batch
 from tests.specs import slow_except, spatial_spec
 
 BOTH = ["asr", "equi_deictic_asr"]

@@ -10,8 +10,7 @@ from torchrl.objectives import LossModule
 
 from ba_torchrl.modules.base import NETWORKS
 from ba_torchrl.modules.spatial.equi_unet import EquivariantPixelValues
-from tests.modules.networks import SPATIAL, XY, XYR, batch, count, values_of
-from tests.modules.networks import spatial as build
+from tests.modules.networks import SPATIAL, XY, XYR, batch, count, spatial as build, values_of
 from tests.specs import slow_except, spatial_spec
 
 EVERY = [*SPATIAL, "asr/pose", "equi_deictic_asr/pose", "equi_asr/flatten"]

@@ -23,10 +23,8 @@ from ba_torchrl.objectives import (
     SACfDLoss,
 )
 from ba_torchrl.objectives.iql import EvalModeTargetsIQLLoss
-from tests.level_tables import ACTIONS, Tables
-from tests.level_tables import batch as level_batch
-from tests.linear_sac import LinearCritics, LinearEncoder, LinearPolicy
-from tests.linear_sac import batch as continuous_batch
+from tests.level_tables import ACTIONS, Tables, batch as level_batch
+from tests.linear_sac import LinearCritics, LinearEncoder, LinearPolicy, batch as continuous_batch
 
 OBSERVATION = [keys.DEPTH, keys.HOLDING]
 

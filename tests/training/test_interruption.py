@@ -11,8 +11,7 @@ from ba_torchrl.algorithms.base import SeedUse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.logging import read_scalars
 from ba_torchrl.record.results import read_result
-from ba_torchrl.training import collection
-from ba_torchrl.training import experiment as experiments
+from ba_torchrl.training import collection, experiment as experiments
 from ba_torchrl.training.checkpoint import Checkpoints, resumable_updates, run_holder, saved_steps
 from ba_torchrl.training.config import ExperimentConfig
 from ba_torchrl.training.experiment import Experiment

@@ -21,8 +21,7 @@ from ba_torchrl.core.files import header_texts
 from ba_torchrl.record.results import PolicyTest, read_result
 from ba_torchrl.record.statistics import mean_success
 from ba_torchrl.tasks.base import TASKS
-from ba_torchrl.training import evaluation, protocol
-from ba_torchrl.training import policy as policies
+from ba_torchrl.training import evaluation, policy as policies, protocol
 from ba_torchrl.training.checkpoint import load as load_checkpoint
 from ba_torchrl.training.experiment import Experiment
 from docs import shipped as shipped_results
