@@ -2,6 +2,7 @@
 
 import ast
 import importlib
+import inspect
 import pydoc
 import re
 from pathlib import Path
@@ -30,6 +31,24 @@ def test_every_public_name_is_described(package):
     for name in set(package.__all__) - {"__version__", "NETWORKS"}:
         assert (getattr(package, name).__doc__ or "").strip(), name
         assert name in dir(package)
+
+
+def test_every_public_method_is_described_or_inherits_its_description():
+    def lacks_text(cls, name):
+        own = (vars(base)[name] for base in cls.__mro__ if name in vars(base))
+        return not any(map(inspect.getdoc, own))
+
+    found = [
+        f"{module}.{node.name}.{method.name}"
+        for module in sources()
+        for node in definitions(module).values()
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_")
+        if module.startswith("ba_torchrl.")
+        for method in node.body
+        if isinstance(method, ast.FunctionDef) and not method.name.startswith("_")
+        if lacks_text(getattr(importlib.import_module(module), node.name), method.name)
+    ]
+    assert found == []
 
 
 def test_the_page_on_torchrl_names_what_is_exported_and_in_the_reference():

@@ -53,7 +53,6 @@ class BC(Learner):
         return make_spatial_values(network, self.problem, self.images)
 
     def make_policy(self, networks: nn.Module) -> TensorDictModuleBase:
-        """Return the policy."""
         if self.problem.control == "close_loop":
             return squashed_gaussian_policy(networks, self.observation_keys)
         seed = self.problem.derived_seed(SeedUse.EXPLORATION)
@@ -77,7 +76,6 @@ class BC(Learner):
         return rotation.build(self.problem, self.images, networks.actions, keys.TARGET_ACTION)
 
     def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the nearest action that the policy can choose."""
         return action if self.actions is None else self.actions.nearest(action)
 
     def on_demonstrations(self, episodes: Sequence[TensorDictBase]) -> None:
@@ -161,6 +159,5 @@ class DAgger(BC):
         return {"mixture": self.policy.generator}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the learner from a `state_dict` of any device."""
         super().load_state_dict(state)
         self._set_beta()

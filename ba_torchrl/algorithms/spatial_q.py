@@ -91,7 +91,6 @@ class SpatialQ(Learner):
         return {"exploration": self.explorer.generator}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the learner from a `state_dict` of any device."""
         super().load_state_dict(state)
         self.target_updater.counter = self.updates % self.config.target_interval
         self._set_epsilon()

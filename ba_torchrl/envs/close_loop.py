@@ -54,7 +54,6 @@ class CloseLoopEnv(RecordedPosition, BulletArmEnv):
 
     @property
     def action_limits(self) -> ActionLimits:
-        """Displacement and rotation of one action."""
         turn = self.config.drot if self.actions.has_yaw else 0.0
         yaw_range = HALF_TURN if self.config.half_rotation else None
         return ActionLimits(self.config.dpos, turn, yaw_range)

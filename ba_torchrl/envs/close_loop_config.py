@@ -18,5 +18,4 @@ class CloseLoopConfig(ControlConfig):
 
     @classmethod
     def make_actions(cls, config: EnvConfig) -> CloseLoopActions:
-        """Return the action space."""
         return CloseLoopActions(config.action_sequence, config.dpos, config.drot)

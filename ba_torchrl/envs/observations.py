@@ -132,7 +132,6 @@ class PoseVector(Observation):
         return config.obs_type == "vec"
 
     def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
-        """Return the declaration of the vector."""
         names = vector_names(len(scene.task.landmarks))
         kinds = [name.rpartition("_")[2] for name in names]
         high = tuple({"opening": 1.0, "yaw": 2.0}.get(kind, _FAR) for kind in kinds)
@@ -194,7 +193,6 @@ class PointCloud(Observation):
     parameter = "point_cloud"
 
     def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
-        """Return the declaration of the points."""
         box = (self.workspace.x, self.workspace.y, self.workspace.z)
         low, high = (tuple(ends[i] + side for ends in box) for i, side in ((0, -1.0), (1, 1.0)))
         points = VectorSpec(("x", "y", "z"), "metres", low, high, rows=self.config.point_cloud)
@@ -220,7 +218,6 @@ class Proprioception(Observation):
     uses_camera = False
 
     def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
-        """Return the declaration of the vector."""
         pose = VectorSpec(
             ("x", "y", "z", "qx", "qy", "qz", "qw", "opening"),
             "metres, a unit quaternion, and 0 (closed) to 1 (open)",
@@ -251,7 +248,6 @@ class Joints(Observation):
     uses_camera = False
 
     def vectors(self, scene: Scene) -> dict[str, VectorSpec]:
-        """Return the declaration of the angles."""
         count = len(scene.robot.arm_joints)
         names = tuple(f"joint {number}" for number in range(count))
         turn = (2 * math.pi,) * count
@@ -268,7 +264,6 @@ class WristRgb(Observation):
     """An RGB image of a camera on the gripper: the fingertips and what is between them."""
 
     def images(self) -> dict[str, ImageSpec]:
-        """Return the declaration of the image."""
         size = self.config.camera_pixels
         spec = ImageSpec(3, size, 255, storage="exact", frame="camera", dtype=torch.uint8)
         return {keys.WRIST_RGB: spec}
@@ -281,7 +276,6 @@ class WristRgb(Observation):
         }
 
     def observe(self, scene: Scene) -> dict[str, Tensor]:
-        """Return the image."""
         lens = wrist_lens(scene.robot.tool_frame())
         rgb, _ = render_rgbd(scene.world, lens, self.config.camera_pixels, WRIST_RANGE_M)
         return {keys.WRIST_RGB: torch.from_numpy(rgb).permute(2, 0, 1)}
@@ -292,7 +286,6 @@ class Segmentation(Observation):
     """The body in each pixel of the camera of `rgb`."""
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specification of the image."""
         size, last = self.config.camera_pixels, len(segmentation_names(scene)) - 1
         spec = Bounded(0, last, (1, size, size), device="cpu", dtype=torch.int32)
         return {keys.SEGMENTATION: spec}
@@ -326,9 +319,7 @@ class Instruction(Observation):
     uses_camera = False
 
     def specs(self, scene: Scene) -> dict[str, TensorSpec]:
-        """Return the specification of the sentence."""
         return {keys.INSTRUCTION: NonTensor((), example_data="", device="cpu")}
 
     def observe(self, scene: Scene) -> dict[str, NonTensorData]:
-        """Return the sentence."""
         return {keys.INSTRUCTION: NonTensorData(scene.task.instruction())}

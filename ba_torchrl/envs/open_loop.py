@@ -194,7 +194,6 @@ class OpenLoopEnv(RecordedPosition, BulletArmEnv):
             yield self._draw(world, arm_m, width, height, ARM_VIEW)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
-        """Close all worlds of this environment."""
         self._display.close()
         super().close(raise_if_closed=raise_if_closed)
 

@@ -90,7 +90,6 @@ class RLPDLoss(SACfDLoss):
 
     @dispatch(auto_batch_size=False)
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Return the losses and detached diagnostics of transitions [...]."""
         return super().forward(tensordict).select(*self.out_keys)
 
     def critic_loss(self, tensordict: TensorDictBase) -> TensorDict:

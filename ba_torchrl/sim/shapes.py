@@ -74,17 +74,14 @@ class Box(Shape):
     size_m: Vector
 
     def mesh(self) -> Mesh:
-        """Return the surface of the box."""
         return box_mesh(self.size_m)
 
     def create_collision(self, client: int) -> int:
-        """Create a collision box."""
         return pybullet.createCollisionShape(
             pybullet.GEOM_BOX, halfExtents=[s / 2 for s in self.size_m], physicsClientId=client
         )
 
     def create_visual(self, client: int) -> int:
-        """Create a visual box."""
         return pybullet.createVisualShape(
             pybullet.GEOM_BOX,
             halfExtents=[s / 2 for s in self.size_m],
@@ -123,7 +120,6 @@ class Solid(Shape):
     collision_margin_m: ClassVar[float | None] = 2e-4
 
     def mesh(self) -> Mesh:
-        """Return the visual surface."""
         return merge_meshes(self.parts) if self.surface is None else self.surface
 
     def create_collision(self, client: int) -> int:
@@ -143,7 +139,6 @@ class Solid(Shape):
             )
 
     def create_visual(self, client: int) -> int:
-        """Create the visual surface."""
         lists = mesh_lists(self.mesh())
         return pybullet.createVisualShape(
             pybullet.GEOM_MESH,

@@ -54,7 +54,6 @@ class Successes(Demonstrations):
     """Weight of the behaviour term; 0 for a replay that draws demonstrations more often."""
 
     def build(self) -> EpisodeAssembler:
-        """Return what assembles collected episodes before they are stored."""
         from ba_torchrl.demonstrations.episodes import EpisodeAssembler
 
         return EpisodeAssembler()

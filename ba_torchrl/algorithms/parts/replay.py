@@ -78,7 +78,6 @@ class Prioritized(_Replay):
 
     @property
     def loss_options(self) -> dict[str, Any]:
-        """Arguments of a loss."""
         return {"weighted_terms": self.weighted_terms, "weight_norm": self.weight_norm}
 
 

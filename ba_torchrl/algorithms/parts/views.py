@@ -77,7 +77,6 @@ class Crop(_Random):
         return [CenterCrop(self.size, list(images))]
 
     def build(self, *args: Any, **options: Any) -> list[Transform]:
-        """Return the crops of sampled transitions."""
         return super().build(*args, size=self.size, **options)
 
 
@@ -89,7 +88,6 @@ class Shift(_Random):
     """Largest shift; that of Kostrikov et al. (2021)."""
 
     def build(self, *args: Any, **options: Any) -> list[Transform]:
-        """Return the shifts of sampled transitions."""
         return super().build(*args, padding=self.pixels, **options)
 
 

@@ -206,7 +206,6 @@ class SerialVectorEnv(Vector):
     """Environments that step sequentially in this process."""
 
     def start(self) -> None:
-        """Make the environments."""
         self._envs = [make_env() for make_env in self.create_env_fn]
         self._last = [TensorDict({}, []) for _ in self._envs]
         self.is_closed = False

@@ -92,7 +92,6 @@ class VectorEnv(Vector):
         return [worker.process.pid for worker in self._workers]
 
     def start(self) -> None:
-        """Start the workers, and wait until all environments are made."""
         outputs = _zeros(self.full_observation_spec, self.full_reward_spec, self.full_done_spec)
         specs = self.observation_spec.items(True, True)
         names = [key for key, spec in specs if isinstance(spec[0], NonTensor)]
@@ -113,13 +112,11 @@ class VectorEnv(Vector):
         self.is_closed = False
 
     def continue_from(self, positions: Sequence[EpisodePosition]) -> None:
-        """Continue episodes; see `Vector.continue_from`."""
         steps = max(sum(map(len, position["actions"])) for position in positions)
         commands = [("call", ("continue_from", position), {}) for position in positions]
         self._ask_all(commands, self.workers.timeout_s + steps * _STEP_S)
 
     def get_positions(self) -> list[EpisodePosition]:
-        """Return the position of each environment; see `Vector.get_positions`."""
         if self._lost:
             raise WorkerError(f"the episodes of environments {sorted(self._lost)} are lost")
         return super().get_positions()

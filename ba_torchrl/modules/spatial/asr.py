@@ -87,7 +87,6 @@ class ASR(SpatialQNetwork):
         return values.squeeze(1), ASRState(heightmap, in_hand, holding, scene)
 
     def later(self, level: int, state: Any, chosen: Tensor) -> Tensor:
-        """Return the Q values [B, n] of a component, given the choices [B, m] before it."""
         if not 1 <= level < len(self.levels):
             raise ValueError(
                 f"the later levels of this network are 1 to {len(self.levels) - 1}, got {level}"

@@ -125,7 +125,6 @@ class Household(ObjectSet):
         return list(ITEMS)
 
     def parts(self, index: int) -> tuple[Mesh, ...]:
-        """Return the convex parts of an item."""
         return tuple(list(ITEMS.values())[index]())
 
 

@@ -65,7 +65,6 @@ class Panda(Robot):
     finger_speed = 0.4
 
     def load(self) -> int:
-        """Load the model."""
         with loading(self.model_file):
             return pybullet.loadURDF(
                 self.model_file, _BASE_M, useFixedBase=True, physicsClientId=self.client

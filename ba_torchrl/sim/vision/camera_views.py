@@ -201,7 +201,6 @@ class TopDown(View):
         return low - setup.fixed_camera_z_m, high + MAX_RECESS_M
 
     def image(self, scene: ViewInput) -> np.ndarray:
-        """Return the image, [1, H, W]."""
         setup, ((x, y, z), yaw) = scene.setup, scene.tool
         center = (x, y) if self.follows_xy else setup.center_m
         turn = yaw if self.follows_yaw else 0.0
@@ -277,7 +276,6 @@ class PointSplat(View):
         return self._top_down.range_m(setup)
 
     def image(self, scene: ViewInput) -> np.ndarray:
-        """Return the image, [1, H, W]."""
         setup, ((x, y, z), _) = scene.setup, scene.tool
         ceiling = max(z - self._clearance_m, self._min_ceiling_m)
         # the image is visible for every position of the tool in the workspace
@@ -293,7 +291,6 @@ class PointSplat(View):
         return self._top_down.to_values(scene, heights, (x, y), 0.0, ceiling)
 
     def camera(self, scene: ViewInput) -> Camera:
-        """Return the geometry."""
         return self._top_down.camera(scene)
 
     @property
@@ -318,7 +315,6 @@ class PerspectiveTopDown(View):
         return 0.0, setup.z_m[1] + setup.camera_height_m + MAX_RECESS_M
 
     def image(self, scene: ViewInput) -> np.ndarray:
-        """Return the image, [1, H, W]."""
         setup, (_, yaw) = scene.setup, scene.tool
         lens = self._lens(scene)
         depth = depth_image([scene.camera.mesh], lens, setup.pixels)
@@ -335,7 +331,6 @@ class PerspectiveTopDown(View):
         return values[None]
 
     def camera(self, scene: ViewInput) -> Camera:
-        """Return the geometry."""
         setup = scene.setup
         return perspective(self._lens(scene), setup.pixels, self.range_m(setup))
 
@@ -364,7 +359,6 @@ class Oblique(View):
         return nearest, lens.plane_depth_range_m(-MAX_RECESS_M)[1]
 
     def image(self, scene: ViewInput) -> np.ndarray:
-        """Return the image, [1, H, W]."""
         setup = scene.setup
         lens = oblique_lens(setup.center_m)
         fingers = finger_boxes(scene.tool, scene.finger_offset_m)
@@ -374,7 +368,6 @@ class Oblique(View):
         return np.clip(values, *self.range_m(setup))[None]
 
     def camera(self, scene: ViewInput) -> Camera:
-        """Return the geometry."""
         setup, values = scene.setup, "height" if self.shows_height else "depth"
         lens = oblique_lens(setup.center_m)
         return perspective(lens, setup.pixels, self.range_m(setup), values)
@@ -399,7 +392,6 @@ class ObliqueRgbd(View):
         return np.concatenate([np.moveaxis(rgb / 255.0, -1, 0), depth[None]])
 
     def camera(self, scene: ViewInput) -> Camera:
-        """Return the geometry."""
         setup = scene.setup
         return perspective(oblique_lens(setup.center_m), setup.pixels, self.range_m(setup))
 

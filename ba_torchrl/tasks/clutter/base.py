@@ -126,7 +126,6 @@ class ClutterTask(Task):
 
     @property
     def continues(self) -> bool:
-        """Whether the next episode continues with the present heap."""
         remaining = len(self.pool.active) - (self.grasped_object() is not None)
         return remaining > 0 and self.attempts + 1 < self.max_attempts
 

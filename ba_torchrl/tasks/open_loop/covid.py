@@ -331,11 +331,9 @@ class CovidTest(OpenLoopTask):
     # -- heights of actions without z --------------------------------------------------------
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a pick without z, metres."""
         return max(top_m - self._tube_m[1] / 2, self.layout.floor_z_m(xy) + self._grasp_m)
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a place without z, metres."""
         return top_m + self._grasp_m + RELEASE_GAP_M
 
     def window_m(self, held: Body | None) -> float:

@@ -66,7 +66,6 @@ class ObjectGrasping(ClutterTask, OpenLoopTask):
         return max(top_m - depth_m, self.terrain.height_m(xy) + FLOOR_GAP_M - tips_m)
 
     def window_m(self, held: Body | None) -> float:
-        """Return half the width of the square window around the target, metres."""
         return WINDOW_M
 
     def expert_command(self) -> PickPlaceCommand:

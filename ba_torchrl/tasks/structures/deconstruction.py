@@ -153,7 +153,6 @@ class Deconstruction(OpenLoopTask):
         return self.task.pick_height_m(top_m - base_m, xy) + base_m
 
     def place_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
-        """Return the height of the tool for a place without z."""
         return self.task.place_height_m(top_m, xy)
 
     def window_m(self, held: Body | None) -> float:

@@ -222,7 +222,6 @@ class PickPlaceGrasps(Grasps):
         return np.maximum(SITE_GAP_M + self.structure.block_m / 2 - gaps, 0.0).sum(axis=1)
 
     def blocks_grasp(self, body: Body, other: Body, position: Vector | None) -> list[bool]:
-        """Return for each grasp of a body whether another piece blocks it."""
         at = body.position
         if position is not None:  # the body is displaced instead of the other piece
             coordinates = zip(at, other.position, position, strict=True)

@@ -133,12 +133,10 @@ class Bumps(SlopedTerrain):
         self._set_layout(BumpLayout(tuple(pyramids.tolist()), heading, PlanarFrame(*center, yaw)))
 
     def set_state(self, state: BumpLayout) -> None:
-        """Restore the layout; the world restores the poses of pyramids and platform."""
         self._use_layout(state)
         self.pool.set_state(state.pyramids)
 
     def heights_m(self, points: np.ndarray) -> np.ndarray:
-        """Return the heights [N] of the surface at points [N, 2], metres."""
         points = np.ascontiguousarray(points, dtype=np.float64)
         heights = np.empty(len(points))
         _surface_heights(points, *self._surface, heights)

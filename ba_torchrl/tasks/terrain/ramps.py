@@ -117,11 +117,9 @@ class Ramps(SlopedTerrain):
         self._set_layout(RampLayout(heading, distances, edges, slopes))
 
     def set_state(self, state: RampLayout) -> None:
-        """Restore the layout; the world restores the poses of the ramps."""
         self.layout = state
 
     def heights_m(self, points: np.ndarray) -> np.ndarray:
-        """Return the heights [N] of the surface at points [N, 2], metres."""
         _, across = self.frame.to_local(*points.T)
         heights = np.zeros(len(points))
         for side, distance, edge, slope in zip(

@@ -65,11 +65,9 @@ class OrientedArea(Area):
 
     @property
     def heading_rad(self) -> float | None:
-        """Heading of an area that is only a line; None for a wider one."""
         return None if self.half_y else self.frame.yaw_rad
 
     def shrunk(self, border_m: float) -> OrientedArea:
-        """Return the area less a border of this width."""
         halves = {"half_x": self.half_x, "half_y": self.half_y}
         smaller = {name: max(half - border_m, 0.0) for name, half in halves.items()}
         return replace(super().shrunk(border_m), **smaller)
@@ -93,7 +91,6 @@ class OrientedArea(Area):
         return points[inside] if inside.any() else points
 
     def random_point(self, rng: np.random.Generator, padding_m: float = 0.0) -> tuple[float, float]:
-        """Return a uniformly random point, as `Area`."""
         area = self.shrunk(padding_m / 2)
         for _ in range(LAYOUT_ATTEMPTS):
             local = (float(rng.uniform(-half, half)) for half in (area.half_x, area.half_y))
@@ -122,7 +119,6 @@ class SlopedTerrain(Terrain):
         return self.spawn_area
 
     def get_state(self) -> Any:
-        """Return the layout."""
         return self.layout
 
     @abstractmethod
@@ -130,11 +126,9 @@ class SlopedTerrain(Terrain):
         """Return the heights [N] of the surface at points [N, 2], metres."""
 
     def height_m(self, xy: tuple[float, float]) -> float:
-        """Return the height of the surface at a point, metres."""
         return float(self.heights_m(np.array([xy]))[0])
 
     def surface_pose(self, xy: tuple[float, float], yaw_rad: float = 0.0) -> Pose:
-        """Return the pose of a frame on the surface, whose z axis is the normal at the point."""
         _, slopes, _ = self._planes(np.array([xy]), PROBE_M)
         return Pose((*xy, self.height_m(xy)), surface_quaternion(_normal(slopes[0]), yaw_rad))
 

@@ -81,7 +81,6 @@ class MultiCollection(WorkerCollection):
         return [process.pid for process in self._collector.procs]
 
     def collect(self) -> TensorDict:
-        """Send the weights and return a batch; see `WorkerCollection.collect`."""
         weights = self.weights()
         while True:
             try:
@@ -96,7 +95,6 @@ class MultiCollection(WorkerCollection):
             return batch
 
     def close(self) -> None:
-        """End the worker processes."""
         threads = torch.get_num_threads()
         self._collector.shutdown(timeout=_SHUTDOWN_S, raise_on_error=False)
         torch.set_num_threads(threads)  # TorchRL increases the number

@@ -58,7 +58,6 @@ class RayCollection(WorkerCollection):
         self._batches = self._collector.iterator()
 
     def collect(self) -> TensorDict:
-        """Send the weights and return a batch; see `WorkerCollection.collect`."""
         try:
             with warnings.catch_warnings():  # of weights that no scheme of TorchRL sends
                 warnings.filterwarnings("ignore", "RayCollector iteration started before weight")
@@ -68,7 +67,6 @@ class RayCollection(WorkerCollection):
             raise failed_too_often(failures, error) from error
 
     def close(self) -> None:
-        """End the workers."""
         self._collector.shutdown()
 
 

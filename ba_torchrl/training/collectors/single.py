@@ -72,7 +72,6 @@ class SingleCollection(Collection):
         return [{**position, keys.CARRIED: each.to_dict()} for position, each in pairs]
 
     def close(self) -> None:
-        """Close the environments."""
         self._collector.shutdown(close_env=False)
         if not self.env.is_closed:
             self.env.close()
