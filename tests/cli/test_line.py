@@ -11,6 +11,7 @@ from omegaconf import OmegaConf
 from ba_torchrl import cli
 from ba_torchrl.cli.command import Arguments
 from ba_torchrl.commands import train
+from ba_torchrl.core.config import descriptions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.config import ExperimentConfig
@@ -158,8 +159,8 @@ def test_the_help_describes_every_setting(name, capsys):
     cli.main([name, "--help"])
     out = capsys.readouterr().out
     model = load_recipe(name).COMMAND.settings
-    for field, info in model.model_fields.items():
-        assert info.description, field
+    assert descriptions(model).keys() == model.model_fields.keys()
+    for field in model.model_fields:
         assert f"\n  {field}" in out or f"\n  '{field}=" in out
 
 
