@@ -59,7 +59,7 @@ def test_the_policy_is_exported_loaded_filmed_and_diagnosed(experiment, tmp_path
             played.append(env.rollout(6, each)[keys.ACTION])
         assert diagnose(env, loaded, [5]).episodes == 1
     assert torch.equal(*played)
-    assert len(record_episodes(policy.config.resolved_env, loaded, 1, seed=0)) > 6
+    assert len(record_episodes(policy.config.env, loaded, 1, seed=0)) > 6
 
 
 def test_a_chunk_is_executed_in_part(experiment):
