@@ -18,8 +18,7 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
-from yaml import ScalarEvent, YAMLError
-from yaml import parse as parse_yaml
+from yaml import ScalarEvent, YAMLError, parse as parse_yaml
 
 from ba_torchrl.cli import PROGRAM, config_dir
 from ba_torchrl.cli.errors import plain_errors

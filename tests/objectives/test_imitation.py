@@ -12,8 +12,7 @@ from ba_torchrl.modules.actor_critic.gaussian_policy import squashed_gaussian_po
 from ba_torchrl.modules.spatial.policy import SpatialValues
 from ba_torchrl.objectives.distance import action_distance
 from ba_torchrl.objectives.imitation import BehaviourCloningLoss, LevelCrossEntropyLoss
-from tests.level_tables import ACTIONS, Tables
-from tests.level_tables import batch as level_batch
+from tests.level_tables import ACTIONS, Tables, batch as level_batch
 from tests.linear_sac import batch
 
 

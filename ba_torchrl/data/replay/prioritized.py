@@ -244,13 +244,13 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
                 f"the saved sampler has capacity {leaves.numel()}, this one {self.max_size}"
             )
         self._init()
+        # before the leaves, which the property would transform; saved runs may lack the entry
+        self.alpha = state_dict.get("alpha", self.alpha)
         written = leaves.nonzero().reshape(-1)  # priorities of stored transitions are positive
         if written.numel():
             self._sum_tree[written] = leaves[written]
             self._min_tree[written] = leaves[written]
         self._largest = state_dict["max_priority"][0] or 1.0
-        # not by the property, which would transform the leaves; saved runs may lack the entry
-        self._alpha = state_dict.get("alpha", self._alpha)
         self.beta = state_dict["beta"]
 
 
