@@ -38,6 +38,7 @@ from ba_torchrl.demonstrations.formats.base import (
     read_file,
     write_file,
 )
+from ba_torchrl.demonstrations.formats.minari import check_neighbours
 from ba_torchrl.demonstrations.mapping import MappedFile, entry_specs
 from ba_torchrl.envs.description import summary
 from ba_torchrl.envs.factory import make
@@ -101,6 +102,11 @@ def export_demonstrations(
                 raise ConfigError(f"episode {number}: {key} has {found}, needed {list(shape)}")
     names = form.names(entries)
     for key, entry in entries.items():
+        if entry.dtype == "str" and key != keys.INSTRUCTION and not form.holds_texts:
+            raise ConfigError(
+                f"{key}: the format {format!r} holds no text but {keys.INSTRUCTION}; leave it out "
+                "of the observations, or use format='minari'"
+            )
         named = entry.model_copy(update={"name": names[key]})
         entries[key] = named.model_copy(update={"file_shape": form.file_shape(named)})
     values, versions = env_values(task, env), versions_of(task)
@@ -127,6 +133,7 @@ def export_demonstrations(
         entries=entries,
     )
     write_file(form, path, arrays, card)
+    check_neighbours(path.resolve().parent)
 
 
 def check_episodes(episodes: Sequence[TensorDictBase], task: str, env: dict[str, Any]) -> None:

@@ -75,6 +75,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
             {key: space_of(spec) for key, spec in specs.items() if key not in INFO_KEYS}
         )
         self.action_space = space_of(self.torchrl_env.action_spec)
+        self._expert_action: np.ndarray | None = None
 
     @property
     def spec(self) -> EnvSpec | None:
@@ -96,6 +97,18 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     def instruction(self) -> str:
         """The goal of the episode as an English sentence."""
         return self.torchrl_env.instruction
+
+    def expert_action(self) -> np.ndarray:
+        """Return the expert's action in the present state, as in ``info``.
+
+        Raises:
+            ConfigError: the environment was made without ``expert=True``, or was not reset.
+        """
+        if self._expert_action is None:
+            raise ConfigError(
+                "the expert was not asked: give expert=True to gymnasium.make, and reset"
+            )
+        return self._expert_action.copy()
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -160,6 +173,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         for key in keys.OF_EXPERT:
             if key in state:
                 info[key] = state[key].numpy()
+        self._expert_action = info.get(keys.EXPERT_ACTION)
         return observation, info
 
 
@@ -174,12 +188,72 @@ class StateObservation(FlattenObservation):
         return self.env.get_wrapper_attr("_max_episode_steps")
 
 
+class ExpertPolicy:
+    """The task's expert with the ``predict`` of policies of Stable-Baselines3.
+
+    It asks the environments for the action in their present state and does not read the
+    observations, so it must be called once between their steps. Libraries that call policies as
+    functions, such as imitation, take it too.
+
+    Args:
+        env: made with ``expert=True``: an environment, a vector of Gymnasium, or a ``VecEnv``.
+
+    Examples:
+        >>> import gymnasium, ba_torchrl
+        >>> from ba_torchrl.envs.gym import ExpertPolicy
+        >>> env = gymnasium.make("BulletArm/CloseLoopBlockReaching-State-v0", expert=True)
+        >>> expert = ExpertPolicy(env)
+        >>> observation, _ = env.reset(seed=0)
+        >>> action, _ = expert.predict(observation)
+        >>> env.step(action)[0].shape
+        (10,)
+        >>> env.close()
+    """
+
+    def __init__(self, env: Any) -> None:
+        self._env = env
+        is_vector = isinstance(env, gymnasium.vector.VectorEnv)
+        self.observation_space: spaces.Space = (
+            env.single_observation_space if is_vector else env.observation_space
+        )
+        self.action_space: spaces.Space = env.single_action_space if is_vector else env.action_space
+
+    def predict(
+        self,
+        observation: Any,
+        state: Any = None,
+        episode_start: Any = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Return the expert's action, [A], or those of a vector, [environments, A]; and ``state``.
+
+        Args:
+            observation: one, or a batch with one for each environment; its values are not read.
+            state: returned as it is.
+            episode_start: not read.
+            deterministic: not read.
+        """
+        name = GymEnv.expert_action.__name__
+        if hasattr(self._env, "env_method"):
+            return np.stack(self._env.env_method(name)), state
+        if isinstance(self._env, gymnasium.vector.VectorEnv):
+            return np.stack(self._env.call(name)), state
+        action = self._env.get_wrapper_attr(name)()
+        space = self.observation_space
+        while isinstance(space, spaces.Dict):
+            key, space = next(iter(space.items()))
+            observation = observation[key]
+        return (action[None] if np.ndim(observation) > len(space.shape) else action), state
+
+    __call__ = predict
+
+
 def space_of(spec: TensorSpec) -> spaces.Space:
-    """Return the Gymnasium space of a TorchRL spec, with the same shape."""
+    """Return the Gymnasium space of a TorchRL spec, with the same shape; flags are 0 or 1."""
     if isinstance(spec, Composite):
         return spaces.Dict({key: space_of(part) for key, part in spec.items()})
-    if isinstance(spec, Binary):
-        return spaces.MultiBinary(spec.shape[0] if len(spec.shape) == 1 else list(spec.shape))
+    if isinstance(spec, Binary):  # normalisers and several learners take no MultiBinary
+        return spaces.Box(0, 1, tuple(spec.shape), np.float32)
     if isinstance(spec, Bounded):
         return spaces.Box(spec.low.numpy(), spec.high.numpy(), dtype=_numpy_dtype(spec))
     if isinstance(spec, Unbounded):

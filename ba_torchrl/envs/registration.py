@@ -12,20 +12,48 @@ from collections.abc import Sequence
 from importlib.abc import MetaPathFinder
 from importlib.machinery import ModuleSpec
 from types import ModuleType
-from typing import Any
+from typing import Any, NamedTuple
 
 from ba_torchrl.core.plugins import MAIN
 from ba_torchrl.core.registry import call_on_registration
 
 NAMESPACE = "BulletArm"
 ENTRY_POINT = "ba_torchrl.envs.gym:GymEnv"
-STATE_WRAPPER = "ba_torchrl.envs.gym:StateObservation"
-VARIANTS: dict[str, dict[str, Any]] = {
-    "": {},
-    "State": {"obs_type": "vec"},
-    "StateDense": {"obs_type": "vec", "reward": "dense"},
+
+
+class Variant(NamedTuple):
+    """A kind of id.
+
+    Args:
+        kwargs: keywords that its environments have by default.
+        wrapper: around them; empty for none.
+    """
+
+    kwargs: dict[str, Any]
+    wrapper: str = ""
+
+
+_STATE = "ba_torchrl.envs.gym:StateObservation"
+VARIANTS = {
+    "": Variant({}),
+    "State": Variant({"obs_type": "vec"}, _STATE),
+    "StateDense": Variant({"obs_type": "vec", "reward": "dense"}, _STATE),
+    "Goal": Variant({"obs_type": "vec"}, "ba_torchrl.envs.goals:GoalObservation"),
 }
-"""By the ending of an id's name, the keywords that its environments have by default."""
+"""By the ending of an id's name."""
+
+
+def variants_of(task: str) -> dict[str, Variant]:
+    """Return the `VARIANTS` of a registered task.
+
+    Without `progress` it has no dense rewards, without an entry in `GOALS` no goals.
+    """
+    from ba_torchrl.tasks.base import TASKS, Task
+    from ba_torchrl.tasks.goals import GOALS
+
+    missing = {"StateDense"} if TASKS.entry(task).progress is Task.progress else set()
+    missing |= set() if task in GOALS else {"Goal"}
+    return {name: variant for name, variant in VARIANTS.items() if name not in missing}
 
 
 def gym_id(task: str, variant: str = "") -> str:
@@ -47,21 +75,19 @@ def gym_id(task: str, variant: str = "") -> str:
 
 
 def register_task(task: str) -> None:
-    """Register a task's `VARIANTS` with Gymnasium, unless they are there, without importing torch.
+    """Register a task's variants with Gymnasium, unless they are there, without importing torch.
 
-    A task without `progress` has no dense variant. No step limit is registered, because the
-    environment truncates the episode at ``max_steps`` of its configuration. A task from outside the
-    package is registered with its module, which the processes of ``gymnasium.make_vec`` import.
+    No step limit is registered, because the environment truncates the episode at ``max_steps`` of
+    its configuration. A task from outside the package is registered with its module, which the
+    processes of ``gymnasium.make_vec`` import.
     """
     from gymnasium.envs.registration import WrapperSpec, register, registry
 
-    from ba_torchrl.tasks.base import TASKS, Task
+    from ba_torchrl.tasks.base import TASKS
 
     module = TASKS.plugin_module(task)
-    for variant, settings in VARIANTS.items():
-        if "reward" in settings and TASKS.entry(task).progress is Task.progress:
-            continue
-        name = gym_id(task, variant)
+    for ending, variant in variants_of(task).items():
+        name = gym_id(task, ending)
         if name in registry:
             other = registry[name].kwargs.get("task")
             if other != task:
@@ -69,10 +95,11 @@ def register_task(task: str) -> None:
                     f"the tasks {other!r} and {task!r} have the same Gymnasium id, {name}"
                 )
             continue
-        kwargs: dict[str, Any] = {"task": task, **settings}
+        kwargs: dict[str, Any] = {"task": task, **variant.kwargs}
         if module is not None and module not in MAIN:
             kwargs["register_modules"] = (module,)
-        wrappers = (WrapperSpec("StateObservation", STATE_WRAPPER, {}),) if settings else ()
+        path = variant.wrapper
+        wrappers = (WrapperSpec(path.rpartition(":")[2], path, {}),) if path else ()
         register(name, entry_point=ENTRY_POINT, additional_wrappers=wrappers, kwargs=kwargs)
 
 

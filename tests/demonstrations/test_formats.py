@@ -32,6 +32,7 @@ from ba_torchrl.demonstrations import (
 from ba_torchrl.demonstrations.demo_files import check_demonstrations, read_demonstrations
 from ba_torchrl.demonstrations.formats import base
 from ba_torchrl.demonstrations.formats.base import FORMATS, Format, read_card
+from ba_torchrl.demonstrations.formats.hdf5 import _split
 from ba_torchrl.demonstrations.mapping import with_results
 from ba_torchrl.demonstrations.plausibility import contradictions
 from ba_torchrl.envs.settings import resolve_env
@@ -191,14 +192,36 @@ def test_minari_recovers_the_environment(collected, tmp_path, monkeypatch):
     exported(tmp_path, collected, "minari")
     monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
     dataset = minari.load_dataset(PATHS["minari"])
-    env = dataset.recover_environment()
-    assert env.observation_space["depth"] == dataset.observation_space["depth"]
+    env = dataset.recover_environment(eval_env=True)
+    assert env.observation_space == dataset.observation_space
+    assert env.action_space == dataset.action_space
+    assert all(
+        values.dtype == dataset.observation_space[key].dtype
+        for key, values in dataset[0].observations.items()
+    )
+    assert minari.get_normalized_score(dataset, dataset[0].rewards.sum()) == 1
     assert env.spec.id == "BulletArm/CloseLoopBlockPicking-v0"
     env.reset(seed=0)
     first = next(iter(dataset.iterate_episodes()))
     for action, depth in zip(first.actions, first.observations["depth"][1:], strict=True):
         np.testing.assert_array_equal(env.step(action)[0]["depth"], depth)
     env.close()
+
+
+def test_minari_lists_its_data_sets_unless_other_exports_are_beside_them(
+    collected, tmp_path, monkeypatch, caplog
+):
+    import minari
+
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    exported(tmp_path, collected, "minari")
+    exported(tmp_path, collected, "hdf5")
+    assert list(minari.list_local_datasets()) == [PATHS["minari"]]
+    assert not caplog.records
+    exported(tmp_path, collected, "zarr")
+    with pytest.raises(ValueError, match="Malformed dataset ID: picking.zarr"):
+        minari.list_local_datasets()
+    assert "takes picking.zarr for a data set: export Minari's data sets to" in caplog.text
 
 
 def test_minari_needs_an_id_and_observations_of_the_environment(collected, tmp_path, episodes):
@@ -259,6 +282,26 @@ def test_hdf5_has_the_layout_of_robomimic(episodes, tmp_path):
         assert demo["rewards"].shape == (2,)
         np.testing.assert_array_equal(demo["actions"], episodes[1]["action"])
         assert json.loads(demo.attrs["ep_meta"]) == {"lang": "pick up block 1"}
+        # as robomimic's SequenceDataset reads `filter_by_attribute`
+        masks = {name: [text.decode() for text in found[:]] for name, found in file["mask"].items()}
+    assert masks == {"train": ["demo_0", "demo_1"], "valid": ["demo_2"]}
+
+
+def test_a_tenth_of_the_episodes_is_for_validation():
+    sizes = {n: [len(part) for part in _split(n).values()] for n in (1, 2, 10, 25)}
+    assert sizes == {1: [1], 2: [1, 1], 10: [9, 1], 25: [23, 2]}
+    assert _split(20)["valid"] == ["demo_9", "demo_19"]
+
+
+@pytest.mark.parametrize("name", ["hdf5", "zarr"])
+def test_texts_other_than_the_instruction_are_refused(name, collected, tmp_path):
+    spoken = [episode.clone() for episode in collected]
+    for each in spoken:
+        for part in (each, each["next"]):
+            part["spoken"] = NonTensorStack(*["please"] * len(each))
+    with pytest.raises(ConfigError, match=f"spoken: the format '{name}' holds no text but instr"):
+        exported(tmp_path, spoken, name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_zarr_has_the_layout_of_diffusion_policy(episodes, tmp_path):

@@ -79,7 +79,7 @@ def test_spaces_match_the_specs(make):
     assert depth.dtype == np.float32
     assert depth.low.tolist() == spec["depth"].low.tolist()
     assert depth.high.tolist() == spec["depth"].high.tolist()
-    assert env.observation_space["holding"] == spaces.MultiBinary(1)
+    assert env.observation_space["holding"] == spaces.Box(0, 1, (1,), np.float32)
     assert env.action_space == spaces.Box(-1, 1, (4,), np.float32)
 
 

@@ -11,6 +11,7 @@ import pytest
 import ba_torchrl
 from ba_torchrl.envs.registration import gym_id, register_tasks
 from ba_torchrl.tasks.base import TASKS, Task
+from ba_torchrl.tasks.goals import GOALS
 
 BUILT_IN = [task for task in TASKS if TASKS.plugin_module(task) is None]
 PICKING = "BulletArm/CloseLoopBlockPicking-v0"
@@ -34,9 +35,11 @@ def test_an_id_ends_in_the_version_of_the_task(monkeypatch):
 
 
 def ids(task):
-    """The ids of a task: images, states, and states with dense rewards if it has them."""
-    is_dense = TASKS[task].progress is not Task.progress
-    return [gym_id(task, variant) for variant in ("", "State", "StateDense")[: 2 + is_dense]]
+    """The ids of a task: images, states, and states with dense rewards and goals if it has them."""
+    kinds = ["", "State"]
+    kinds += ["StateDense"] if TASKS[task].progress is not Task.progress else []
+    kinds += ["Goal"] if task in GOALS else []
+    return [gym_id(task, kind) for kind in kinds]
 
 
 def test_every_task_has_ids_of_its_own():
@@ -45,6 +48,7 @@ def test_every_task_has_ids_of_its_own():
     assert {name: spec.kwargs["task"] for name, spec in specs.items()} == expected
     assert "BulletArm/CloseLoopBlockReaching-StateDense-v0" in specs
     assert "BulletArm/OpenLoopCovidTest-State-v0" in specs
+    assert "BulletArm/CloseLoopBlockPushing-Goal-v0" in specs
     assert "BulletArm/OpenLoopCovidTest-StateDense-v0" not in specs
     assert all(spec.max_episode_steps is None for spec in specs.values())
 

@@ -194,6 +194,8 @@ class Format(ABC):
     """Whether images are stored with their channels last."""
     has_last_observation: ClassVar[bool] = True
     """Whether the observation after the last action has a place; if not, a file beside holds it."""
+    holds_texts: ClassVar[bool] = False
+    """Whether it has a place for texts other than the instruction."""
     before_first_step: ClassVar[str | None] = None
     """Prefix of the entries that have a row before the first step, as observations have."""
     tag: ClassVar[str] = "BA-TorchRL"

@@ -30,10 +30,13 @@ _GYM_TYPE = 2
 _OBS, _NEXT_OBS = "obs/", "next_obs/"
 _LANGUAGE = "ep_meta/lang"
 """robomimic's name of the instruction, in an attribute of the episode."""
+_VALID_EVERY = 10
+"""One of so many episodes is for validation, as in robomimic's own split."""
 
 
 class Robomimic(Format):
-    """``data/demo_0/{obs,next_obs,actions,rewards,dones}``, channels last."""
+    """``data/demo_0/{obs,next_obs,actions,rewards,dones}``, channels last, and
+    ``mask/{train,valid}``, the names of the episodes to learn from and of those to validate on."""
 
     channels_last = True
     package = "h5py"
@@ -79,6 +82,8 @@ class Robomimic(Format):
                         _store(demo, name.replace(_OBS, _NEXT_OBS, 1), values[1:])
                     else:
                         _store(demo, name, values[:, 0] if name in results else values)
+            for name, demos in _split(len(episodes)).items():
+                file[f"mask/{name}"] = np.array(demos, dtype="S")
         path.write_bytes(content.getbuffer())
 
     def read(self, path: Path) -> list[StoredArrays]:
@@ -106,6 +111,15 @@ class Robomimic(Format):
                     arrays[_LANGUAGE] = np.array([language])
                 episodes.append(arrays)
         return episodes
+
+
+def _split(episodes: int) -> dict[str, list[str]]:
+    """Return the names of the episodes for training and for validation, of one for training."""
+    demos = [f"demo_{i}" for i in range(episodes)]
+    step = max(min(_VALID_EVERY, episodes), 2)
+    valid = demos[step - 1 :: step]
+    parts = {"train": [demo for demo in demos if demo not in valid], "valid": valid}
+    return {name: part for name, part in parts.items() if part}
 
 
 def datasets_below(group: Any, above: tuple[Any, ...] = ()) -> Iterator[tuple[str, Any]]:

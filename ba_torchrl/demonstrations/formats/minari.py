@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import errno
+import logging
 import os
 import shutil
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from inspect import signature
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -27,6 +28,8 @@ from ba_torchrl.demonstrations.formats.base import (
 )
 from ba_torchrl.demonstrations.formats.hdf5 import datasets_below, unwritten
 from ba_torchrl.envs.registration import gym_id, register_task
+
+logger = logging.getLogger(__name__)
 
 _ROOT = "MINARI_DATASETS_PATH"
 _OBSERVATIONS, _INFOS = "observations/", "infos/"
@@ -48,6 +51,7 @@ class Minari(Format):
 
     package = "minari"
     tag = "minari"
+    holds_texts = True
     before_first_step = _INFOS
 
     def matches(self, path: Path) -> bool:
@@ -57,7 +61,7 @@ class Minari(Format):
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
         """Return names: ``observations/depth``, ``actions``, ``infos/success``."""
         observed = {
-            key: entry.role == "observation" and key != keys.INSTRUCTION
+            key: entry.role == "observation" and entry.dtype != "str"
             for key, entry in entries.items()
         }
         return {
@@ -86,45 +90,56 @@ class Minari(Format):
         _check_space(path.parent, episodes)
         register_task(card.task)
         env = gymnasium.make(gym_id(card.task), **card.env)
-        buffers = [
-            minari.data_collector.EpisodeBuffer(
-                id=i,
-                observations=_below(arrays, _OBSERVATIONS),
-                actions=arrays["actions"],
-                rewards=arrays["rewards"][:, 0],
-                terminations=arrays["terminations"][:, 0],
-                truncations=arrays["truncations"][:, 0],
-                infos={
-                    entry.name.removeprefix(_INFOS): _info(entry, arrays[entry.name])
-                    for entry in card.entries.values()
-                    if entry.name.startswith(_INFOS)
-                },
-            )
-            for i, arrays in enumerate(episodes)
-        ]
         spaces = env.observation_space.spaces
-        observed = buffers[0].observations
+        observed = _below(episodes[0], _OBSERVATIONS)
         try:
             if missing := observed.keys() - spaces.keys():
                 raise ConfigError(
-                    f"the Gymnasium environment does not observe {', '.join(missing)}"
+                    f"the Gymnasium environment does not observe {', '.join(sorted(missing))}"
                 )
+            buffers = [
+                minari.data_collector.EpisodeBuffer(
+                    id=i,
+                    observations={
+                        key: values.astype(spaces[key].dtype)
+                        for key, values in _below(arrays, _OBSERVATIONS).items()
+                    },
+                    actions=arrays["actions"],
+                    rewards=arrays["rewards"][:, 0],
+                    terminations=arrays["terminations"][:, 0],
+                    truncations=arrays["truncations"][:, 0],
+                    infos={
+                        entry.name.removeprefix(_INFOS): _info(entry, arrays[entry.name])
+                        for entry in card.entries.values()
+                        if entry.name.startswith(_INFOS)
+                    },
+                )
+                for i, arrays in enumerate(episodes)
+            ]
+            create = minari.create_dataset_from_buffers
+            # Minari 0.5.4 would store images as JPEG
+            raw = (
+                {"jpeg_encoding": False} if "jpeg_encoding" in signature(create).parameters else {}
+            )
             with _datasets_at(path.resolve().parent), warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of e-mail and web addresses that are not given
-                minari.create_dataset_from_buffers(
+                dataset = create(
                     path.name,
                     buffers,
-                    env=env.spec,
-                    observation_space=gymnasium.spaces.Dict(
-                        {key: _plain_space(spaces[key]) for key in observed}
-                    ),
+                    env=env,
+                    eval_env=env,
+                    observation_space=gymnasium.spaces.Dict({key: spaces[key] for key in observed}),
                     action_space=env.action_space,
                     algorithm_name=card.source,
                     author="BA-TorchRL",
                     description=f"{card.goal} Robot: {card.robot}.",
                     data_format="hdf5",
                     requirements=[f"ba-torchrl=={card.versions['ba_torchrl']}"],
+                    **raw,
                 )
+                if card.env["reward"] == "sparse":  # a normalised score is the rate of success
+                    scores = {"ref_min_score": 0.0, "ref_max_score": 1.0}
+                    dataset.storage.update_metadata(scores)
         finally:
             env.close()
 
@@ -182,12 +197,22 @@ def _info(entry: Entry, values: np.ndarray) -> np.ndarray | list[str]:
     return np.concatenate([missing, values] if entry.role == "result" else [values, missing])
 
 
-def _plain_space(space: Any) -> Any:
-    """Return a space; that of flags as a box from 0 to 1, since TorchRL's reader of Minari's data
-    sets takes no MultiBinary."""
-    from gymnasium.spaces import Box, MultiBinary
+def check_neighbours(folder: Path) -> None:
+    """Warn of folders beside Minari's data sets that `minari list` takes for data sets.
 
-    return Box(0, 1, space.shape, np.uint8) if isinstance(space, MultiBinary) else space
+    Args:
+        folder: with exports of any format.
+    """
+    exports = [path for path in sorted(folder.iterdir()) if (path / "data").is_dir()]
+    sets = [path for path in exports if os.path.isfile(path / "data" / "metadata.json")]
+    others = [path.name for path in exports if path not in sets and path.name[:1] != "."]
+    if sets and others:
+        logger.warning(
+            "`minari list` fails with MINARI_DATASETS_PATH=%s, because it takes %s for a data set: "
+            "export Minari's data sets to a folder of their own",
+            folder,
+            ", ".join(others),
+        )
 
 
 def _below(arrays: Arrays, place: str) -> Arrays:
