@@ -219,7 +219,7 @@ def test_minari_lists_its_data_sets_unless_other_exports_are_beside_them(
     assert list(minari.list_local_datasets()) == [PATHS["minari"]]
     assert not caplog.records
     exported(tmp_path, collected, "zarr")
-    with pytest.raises(ValueError, match="Malformed dataset ID: picking.zarr"):
+    with pytest.raises(ValueError, match=r"Malformed dataset ID: picking\.zarr"):
         minari.list_local_datasets()
     assert "takes picking.zarr for a data set: export Minari's data sets to" in caplog.text
 

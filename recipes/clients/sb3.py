@@ -1,0 +1,35 @@
+"""Stable-Baselines3 and sb3-contrib: TQC learns to reach a block from its state.
+
+pip install stable-baselines3==2.9.2 sb3-contrib==2.9.2
+python recipes/clients/sb3.py --steps 5000
+"""
+
+from __future__ import annotations
+
+import argparse
+
+import gymnasium
+from played import played
+from sb3_contrib import TQC
+
+parser = argparse.ArgumentParser()
+parser.add_argument("--steps", type=int, default=5000)
+parser.add_argument("--seed", type=int, default=0)
+options = parser.parse_args()
+
+ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
+env = gymnasium.make(ENV, reward="difference", reward_discount=0.95, seed=options.seed)
+agent = TQC(
+    "MlpPolicy",
+    env,
+    gamma=0.95,
+    learning_rate=1e-3,
+    tau=0.02,
+    batch_size=128,
+    learning_starts=500,
+    ent_coef="auto_0.1",
+    target_entropy=-2.0,
+    policy_kwargs={"net_arch": [64, 64]},
+    seed=options.seed,
+).learn(options.steps)
+played(lambda state: agent.predict(state, deterministic=True)[0], ENV)
