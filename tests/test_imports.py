@@ -41,6 +41,8 @@ APART = {
     # measurements, which read every part
     "recipes.profiling": {"core", "__init__", "sim", "tasks", "envs", "demonstrations", "data"}
     | {"modules", "objectives", "algorithms", "training", "record"},
+    # other libraries beside the environments
+    "recipes.clients": {"core", "envs", "__init__"},
     # whole algorithms as scripts: no learner and no experiment
     "recipes.torchrl": {"core", "envs", "demonstrations", "data", "modules", "objectives"}
     | {"__init__"},

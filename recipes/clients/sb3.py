@@ -7,19 +7,22 @@ python recipes/clients/sb3.py --steps 5000
 from __future__ import annotations
 
 import argparse
+import importlib
 
 import gymnasium
 from played import played
-from sb3_contrib import TQC
 
+ALGORITHMS = {"sac": ("stable_baselines3", "SAC"), "tqc": ("sb3_contrib", "TQC")}
 parser = argparse.ArgumentParser()
+parser.add_argument("algorithm", choices=ALGORITHMS)
 parser.add_argument("--steps", type=int, default=5000)
 parser.add_argument("--seed", type=int, default=0)
 options = parser.parse_args()
 
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
 env = gymnasium.make(ENV, reward="difference", reward_discount=0.95, seed=options.seed)
-agent = TQC(
+module, name = ALGORITHMS[options.algorithm]
+agent = getattr(importlib.import_module(module), name)(
     "MlpPolicy",
     env,
     gamma=0.95,
