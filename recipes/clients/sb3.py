@@ -15,12 +15,13 @@ from played import played
 ALGORITHMS = {"sac": ("stable_baselines3", "SAC"), "tqc": ("sb3_contrib", "TQC")}
 parser = argparse.ArgumentParser()
 parser.add_argument("algorithm", choices=ALGORITHMS)
-parser.add_argument("--steps", type=int, default=5000)
+parser.add_argument("--steps", type=int, default=6000)
 parser.add_argument("--seed", type=int, default=0)
 options = parser.parse_args()
 
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
-env = gymnasium.make(ENV, reward="difference", reward_discount=0.95, seed=options.seed)
+VALUES = {"action_sequence": "pxyz", "random_orientation": False}  # without yaw
+env = gymnasium.make(ENV, reward="difference", reward_discount=0.95, seed=options.seed, **VALUES)
 module, name = ALGORITHMS[options.algorithm]
 agent = getattr(importlib.import_module(module), name)(
     "MlpPolicy",
@@ -28,11 +29,8 @@ agent = getattr(importlib.import_module(module), name)(
     gamma=0.95,
     learning_rate=1e-3,
     tau=0.02,
-    batch_size=128,
-    learning_starts=500,
     ent_coef="auto_0.1",
     target_entropy=-2.0,
-    policy_kwargs={"net_arch": [64, 64]},
     seed=options.seed,
 ).learn(options.steps)
-played(lambda state: agent.predict(state, deterministic=True)[0], ENV)
+played(lambda state: agent.predict(state, deterministic=True)[0], ENV, **VALUES)

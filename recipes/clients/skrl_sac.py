@@ -1,7 +1,7 @@
 """skrl: SAC learns to reach a block from its state.
 
 pip install "skrl[torch]==2.1.1"
-python recipes/clients/skrl_sac.py --steps 5000
+python recipes/clients/skrl_sac.py --steps 4000
 """
 
 from __future__ import annotations
@@ -20,18 +20,20 @@ from skrl.utils import set_seed
 from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_model
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--steps", type=int, default=5000)
+parser.add_argument("--steps", type=int, default=4000)
 options = parser.parse_args()
-
 set_seed(0)
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
-env = wrap_env(gymnasium.make(ENV, reward="difference", reward_discount=0.95, seed=0))
+VALUES = {"action_sequence": "pxyz", "random_orientation": False}  # without yaw
+env = gymnasium.make(ENV, reward="difference", reward_discount=0.95, seed=0, **VALUES)
+env = wrap_env(env)
 spaces = {"observation_space": env.observation_space, "action_space": env.action_space}
 
-hidden = {"name": "net", "layers": [64, 64], "activations": "relu"}
+hidden = {"name": "net", "layers": [128, 128], "activations": "relu"}
 policy = gaussian_model(
     **spaces,
     clip_actions=True,
+    initial_log_std=-1.0,
     network=[{**hidden, "input": "OBSERVATIONS"}],
     output="tanh(ACTIONS)",
 )
@@ -55,4 +57,4 @@ def act(state: np.ndarray) -> np.ndarray:
     return policy.act(inputs, role="policy")[1]["mean_actions"].numpy()
 
 
-played(act, ENV)
+played(act, ENV, **VALUES)

@@ -1,7 +1,7 @@
 """Tianshou: SAC learns to reach a block from its state.
 
 pip install tianshou==2.0.1
-python recipes/clients/tianshou_sac.py --steps 5000
+python recipes/clients/tianshou_sac.py --steps 4000
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from tianshou.utils.net.common import Net
 from tianshou.utils.net.continuous import ContinuousActorProbabilistic, ContinuousCritic
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--steps", type=int, default=5000)
+parser.add_argument("--steps", type=int, default=4000)
 options = parser.parse_args()
-
 torch.manual_seed(0)
 np.random.seed(0)  # noqa: NPY002 -- the library draws from it
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
-kwargs = {"reward": "difference", "reward_discount": 0.95, "seed": 0}
-envs = DummyVectorEnv([lambda: gymnasium.make(ENV, **kwargs)])
+VALUES = {"action_sequence": "pxyz", "random_orientation": False}  # without yaw
+REWARD = {"reward": "difference", "reward_discount": 0.95}
+envs = DummyVectorEnv([lambda: gymnasium.make(ENV, seed=0, **REWARD, **VALUES)])
 state, action = envs.observation_space[0].shape, envs.action_space[0].shape
 optimizer = AdamOptimizerFactory(lr=1e-3)
-shapes = {"state_shape": state, "hidden_sizes": [64, 64]}
+shapes = {"state_shape": state, "hidden_sizes": [128, 128]}
 actor = ContinuousActorProbabilistic(
     preprocess_net=Net(**shapes), action_shape=action, unbounded=True, conditioned_sigma=True
 )
@@ -57,4 +57,4 @@ collector.collect(n_step=500, random=True)
 sizes = {"epoch_num_steps": options.steps, "collection_step_num_env_steps": 1, "batch_size": 128}
 algorithm.run_training(OffPolicyTrainerParams(training_collector=collector, max_epochs=1, **sizes))
 algorithm.policy.eval()
-played(lambda state: algorithm.policy.compute_action(state), ENV)
+played(lambda state: algorithm.policy.compute_action(state), ENV, **VALUES)

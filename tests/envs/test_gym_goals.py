@@ -151,6 +151,18 @@ def test_a_task_of_ones_own_gets_goals_by_an_entry(monkeypatch):
     env.close()
 
 
+def test_normalisers_take_flags(make):
+    from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+    name = gym_id("close_loop/block_reaching")
+    vector = VecNormalize(DummyVecEnv([lambda: make(name, obs_type="vec")]))
+    observation = vector.reset()
+    assert {key: values.shape for key, values in observation.items()} == {
+        "holding": (1, 1),
+        "observation": (1, 9),
+    }
+
+
 # -- the expert ------------------------------------------------------------------------------
 
 
