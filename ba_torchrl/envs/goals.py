@@ -4,84 +4,55 @@ from __future__ import annotations
 
 from typing import Any
 
-import gymnasium
 import numpy as np
 from gymnasium import spaces
+from tensordict import TensorDictBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.envs.gym import GymEnv, StateObservation
+from ba_torchrl.envs.gym import GymEnv, Observation
 from ba_torchrl.envs.observations import vector_names
 from ba_torchrl.tasks.goals import GOALS
 
 _GOALS = ("achieved_goal", "desired_goal")
 
-GoalDict = dict[str, np.ndarray]
 
+class GoalEnv(GymEnv):
+    """A `GymEnv` with a state in ``observation`` beside ``achieved_goal`` and ``desired_goal``.
 
-class GoalObservation(gymnasium.Wrapper[GoalDict, np.ndarray, GoalDict, np.ndarray]):
-    """A state in ``observation`` beside ``achieved_goal`` and ``desired_goal``.
-
-    The state is that of `StateObservation` without the pose of the goal. Rewards and ends are those
-    of the task; the three ``compute_...`` methods return them for other goals. A simulator fault
-    and an invalid scene achieve nothing: both goals are then those of the step before.
+    The state is that of `StateEnv` without the pose of the goal. Rewards and ends are those of the
+    task; the three ``compute_...`` methods return them for other goals. A simulator fault and an
+    invalid scene achieve nothing: both goals are then those of the step before.
 
     Args:
-        env: of a task of `ba_torchrl.tasks.goals.GOALS`, with ``obs_type="vec"`` and sparse rewards
+        task: one of `ba_torchrl.tasks.goals.GOALS`.
+        config: as of `GymEnv`, with ``obs_type="vec"`` and sparse rewards.
 
     Raises:
-        ConfigError: the environment is another one.
+        ConfigError: the task has no goals, or the configuration is another one.
     """
 
-    _max_episode_steps = StateObservation._max_episode_steps
-
-    def __init__(self, env: gymnasium.Env) -> None:
-        super().__init__(env)
-        inner: GymEnv = env.unwrapped
-        self._env = inner.torchrl_env
-        self._task_class = self._env.task_class
-        name, config = self._env.task_id, self._env.config
-        if name not in GOALS:
-            raise ConfigError(f"{name} has no goals as vectors. Known: {', '.join(GOALS)}")
+    def __init__(self, task: str, *args: Any, **config: Any) -> None:
+        if task not in GOALS:
+            raise ConfigError(f"{task} has no goals as vectors. Known: {', '.join(GOALS)}")
         for field, needed in (("obs_type", "vec"), ("reward", "sparse")):
-            if getattr(config, field) != needed:
+            if config.get(field, needed) != needed:
                 raise ConfigError(
-                    f"{field}={getattr(config, field)!r}: ids with goals have "
-                    f"{field}={needed!r}; leave it out"
+                    f"{field}={config[field]!r}: ids with goals have {field}={needed!r}; leave it "
+                    "out"
                 )
-        self._goal = GOALS[name]
-        objects = self._env.observation_spec[keys.OBSERVATION].shape[0] // 4 - 1
+        super().__init__(task, *args, **config)
+        self._goal = GOALS[task]
+        poses = self._entries[keys.OBSERVATION]
         goals = tuple(f"object_{place}_" for place in self._goal.landmarks)
-        self._kept = [
-            i for i, each in enumerate(vector_names(objects)) if not each.startswith(goals)
-        ]
-        found = env.observation_space
-        poses = found[keys.OBSERVATION]
+        names = vector_names(poses.shape[0] // 4 - 1)
+        self._kept = [i for i, name in enumerate(names) if not name.startswith(goals)]
         kept = spaces.Box(poses.low[self._kept], poses.high[self._kept], dtype=poses.dtype)
-        self._state_space = spaces.Dict({**found.spaces, keys.OBSERVATION: kept})
+        self._state_entries = spaces.Dict({**self._entries.spaces, keys.OBSERVATION: kept})
         goal = spaces.Box(-np.inf, np.inf, (len(self._goal.names),), np.float32)
-        self.observation_space = spaces.Dict(
-            {
-                "observation": spaces.flatten_space(self._state_space),
-                **dict.fromkeys(_GOALS, goal),
-            }
-        )
-        self._values: GoalDict = {}
-
-    def reset(
-        self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[GoalDict, dict[str, Any]]:
-        """Start an episode."""
-        observation, info = self.env.reset(seed=seed, options=options)
-        self._measure()
-        return self._with_goals(observation), info
-
-    def step(self, action: np.ndarray) -> tuple[GoalDict, float, bool, bool, dict[str, Any]]:
-        """Execute an action."""
-        observation, reward, terminated, truncated, info = self.env.step(action)
-        if not info[keys.FAULT] and (info[keys.SUCCESS] or not terminated):
-            self._measure()
-        return self._with_goals(observation), reward, terminated, truncated, info
+        state = spaces.flatten_space(self._state_entries)
+        self.observation_space = spaces.Dict({"observation": state, **dict.fromkeys(_GOALS, goal)})
+        self._values: Observation = {}
 
     def compute_reward(self, achieved_goal: np.ndarray, desired_goal: np.ndarray, info: Any) -> Any:
         """Return 1 where a goal is reached, else 0; goals [n] give a number, [..., n] an array."""
@@ -107,16 +78,16 @@ class GoalObservation(gymnasium.Wrapper[GoalDict, np.ndarray, GoalDict, np.ndarr
                     f"{name} [..., {len(self._goal.names)}] is needed "
                     f"({', '.join(self._goal.names)}), not {list(values.shape)}"
                 )
-        return np.asarray(self._goal.is_reached(self._task_class, achieved, desired))
+        return np.asarray(self._goal.is_reached(self.torchrl_env.task_class, achieved, desired))
 
-    def _measure(self) -> None:
-        task = self._env.scene.task
-        both = (self._goal.achieved(task), self._goal.desired(task))
-        values = (np.array(each, dtype=np.float32) for each in both)
-        self._values = dict(zip(_GOALS, values, strict=True))
-
-    def _with_goals(self, observation: GoalDict) -> GoalDict:
+    def _split(self, state: TensorDictBase) -> tuple[Observation, dict[str, Any]]:
+        observation, info = super()._split(state)
+        if not state[keys.FAULT] and (state[keys.SUCCESS] or not state[keys.TERMINATED]):
+            task = self.torchrl_env.scene.task
+            both = (self._goal.achieved(task), self._goal.desired(task))
+            values = (np.array(each, dtype=np.float32) for each in both)
+            self._values = dict(zip(_GOALS, values, strict=True))
         poses = observation[keys.OBSERVATION][self._kept]
-        state = spaces.flatten(self._state_space, {**observation, keys.OBSERVATION: poses})
+        seen = spaces.flatten(self._state_entries, {**observation, keys.OBSERVATION: poses})
         copies = {name: values.copy() for name, values in self._values.items()}
-        return {"observation": state, **copies}
+        return {"observation": seen, **copies}, info

@@ -12,7 +12,6 @@ import numpy as np
 import torch
 from gymnasium import spaces
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.wrappers import FlattenObservation
 from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, TensorSpec, Unbounded
 from typing_extensions import Self
@@ -71,9 +70,10 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         self.torchrl_env = make(resolve_env(task, config, modules=register_modules))
         """The same environment for TorchRL; stepping it steps this one."""
         specs = self.torchrl_env.observation_spec
-        self.observation_space = spaces.Dict(
+        self._entries = spaces.Dict(
             {key: space_of(spec) for key, spec in specs.items() if key not in INFO_KEYS}
         )
+        self.observation_space: spaces.Space = self._entries
         self.action_space = space_of(self.torchrl_env.action_spec)
         self._expert_action: np.ndarray | None = None
 
@@ -90,7 +90,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     @property
     def _max_episode_steps(self) -> int:
-        """The step limit, under the name of Gymnasium's `TimeLimit`, which scripts read."""
+        """The step limit; see `StepLimit`."""
         return self.torchrl_env.max_steps
 
     @property
@@ -152,11 +152,11 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     def __copy__(self) -> Self:
         return copy.deepcopy(self)  # both would step the same simulator
 
-    def _split(self, state: TensorDictBase) -> tuple[Observation, dict[str, Any]]:
+    def _split(self, state: TensorDictBase) -> tuple[Any, dict[str, Any]]:
         """Return the observation and the info of a state of the TorchRL environment."""
         observation = {
             key: state[key].numpy().astype(space.dtype, copy=False)
-            for key, space in self.observation_space.items()
+            for key, space in self._entries.items()
         }
         values: dict[str, Any] = {
             key: state[key].item() for key in (keys.SUCCESS, keys.FAULT, keys.STEP_COUNT)
@@ -177,11 +177,27 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         return observation, info
 
 
-class StateObservation(FlattenObservation):
-    """All observations of a `GymEnv` in one vector, in the order of its space's keys.
+class StateEnv(GymEnv):
+    """A `GymEnv` with all observations in one vector, in the order of their keys.
 
     With poses these are ``holding`` as 0 or 1, then the numbers of ``observation``.
     """
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.observation_space = spaces.flatten_space(self._entries)
+
+    def _split(self, state: TensorDictBase) -> tuple[np.ndarray, dict[str, Any]]:
+        observation, info = super()._split(state)
+        return spaces.flatten(self._entries, observation), info
+
+
+class StepLimit(gymnasium.Wrapper, gymnasium.utils.RecordConstructorArgs):
+    """Has the step limit under the name of Gymnasium's `TimeLimit`, which scripts read."""
+
+    def __init__(self, env: gymnasium.Env) -> None:
+        gymnasium.utils.RecordConstructorArgs.__init__(self)  # so that its spec makes it again
+        super().__init__(env)
 
     @property
     def _max_episode_steps(self) -> int:

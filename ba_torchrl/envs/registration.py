@@ -18,27 +18,26 @@ from ba_torchrl.core.plugins import MAIN
 from ba_torchrl.core.registry import call_on_registration
 
 NAMESPACE = "BulletArm"
-ENTRY_POINT = "ba_torchrl.envs.gym:GymEnv"
+STEP_LIMIT = "ba_torchrl.envs.gym:StepLimit"
 
 
 class Variant(NamedTuple):
     """A kind of id.
 
     Args:
-        kwargs: keywords that its environments have by default.
-        wrapper: around them; empty for none.
+        entry_point: of its environments.
+        kwargs: keywords that they have by default.
     """
 
+    entry_point: str
     kwargs: dict[str, Any]
-    wrapper: str = ""
 
 
-_STATE = "ba_torchrl.envs.gym:StateObservation"
 VARIANTS = {
-    "": Variant({}),
-    "State": Variant({"obs_type": "vec"}, _STATE),
-    "StateDense": Variant({"obs_type": "vec", "reward": "dense"}, _STATE),
-    "Goal": Variant({"obs_type": "vec"}, "ba_torchrl.envs.goals:GoalObservation"),
+    "": Variant("ba_torchrl.envs.gym:GymEnv", {}),
+    "State": Variant("ba_torchrl.envs.gym:StateEnv", {"obs_type": "vec"}),
+    "StateDense": Variant("ba_torchrl.envs.gym:StateEnv", {"obs_type": "vec", "reward": "dense"}),
+    "Goal": Variant("ba_torchrl.envs.goals:GoalEnv", {"obs_type": "vec"}),
 }
 """By the ending of an id's name."""
 
@@ -98,9 +97,13 @@ def register_task(task: str) -> None:
         kwargs: dict[str, Any] = {"task": task, **variant.kwargs}
         if module is not None and module not in MAIN:
             kwargs["register_modules"] = (module,)
-        path = variant.wrapper
-        wrappers = (WrapperSpec(path.rpartition(":")[2], path, {}),) if path else ()
-        register(name, entry_point=ENTRY_POINT, additional_wrappers=wrappers, kwargs=kwargs)
+        wrappers = (WrapperSpec("StepLimit", STEP_LIMIT, {}),) if ending else ()
+        register(
+            name,
+            entry_point=variant.entry_point,
+            additional_wrappers=wrappers,
+            kwargs=kwargs,
+        )
 
 
 def register_tasks() -> None:

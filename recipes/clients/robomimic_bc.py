@@ -3,7 +3,7 @@
 pip install robomimic==0.3.0
 ba-torchrl collect task=close_loop/block_reaching episodes=50 env.obs_type=vec path=demos/reaching
 ba-torchrl convert demos/reaching format=hdf5 path=exports/reaching.hdf5
-python recipes/clients/robomimic_bc.py exports/reaching.hdf5 --epochs 20
+python recipes/clients/robomimic_bc.py exports/reaching.hdf5 --epochs 8
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from robomimic.utils.file_utils import policy_from_checkpoint
 
 parser = argparse.ArgumentParser()
 parser.add_argument("file", help="of ba-torchrl convert format=hdf5")
-parser.add_argument("--epochs", type=int, default=20)
+parser.add_argument("--epochs", type=int, default=8)
 options = parser.parse_args()
 
 config = config_factory("bc")
@@ -28,7 +28,7 @@ with config.values_unlocked():
     config.train.data = options.file
     config.train.output_dir = tempfile.mkdtemp()
     config.train.num_epochs = options.epochs
-    config.train.batch_size = 16
+    config.train.batch_size = 8  # no more than the steps of the validation
     config.train.hdf5_filter_key, config.train.hdf5_validation_filter_key = "train", "valid"
     config.train.seed = 0
     config.observation.modalities.obs.low_dim = ["observation", "holding"]

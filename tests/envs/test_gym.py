@@ -180,6 +180,7 @@ def test_a_state_is_one_box_that_torchrl_and_normalisers_take(variant):
     poses = gymnasium.make(gym_id("close_loop/block_reaching"), obs_type="vec", seed=0)
     (state, info), (expected, _) = env.reset(seed=1), poses.reset(seed=1)
     assert env.observation_space == spaces.flatten_space(poses.observation_space)
+    assert env.unwrapped.observation_space == env.observation_space  # where Tianshou reads it
     assert state in env.observation_space
     assert state.tolist() == [*expected["holding"], *expected["observation"]]
     assert (env.spec.max_episode_steps, env._max_episode_steps) == (30, 30)

@@ -31,7 +31,7 @@ def make():
 def test_rewards_and_ends_are_those_of_the_goals(make, task):
     env = make(gym_id(task, "Goal"), expert=True, max_steps=20)
     plain = make(gym_id(task, "State"), max_steps=20)
-    compute = [env.get_wrapper_attr(f"compute_{what}") for what in ("reward", "terminated")]
+    compute = [getattr(env.unwrapped, f"compute_{what}") for what in ("reward", "terminated")]
     expert, steps, successes = ExpertPolicy(env), [], 0
     rng = np.random.default_rng(0)
     for seed in range(4):
@@ -57,7 +57,7 @@ def test_rewards_and_ends_are_those_of_the_goals(make, task):
     assert compute[0](achieved[None], desired[None], [{}])[0].tolist() == rewards.tolist()
     assert compute[1](achieved, desired, {}).tolist() == ends.tolist()
     assert compute[0](achieved, achieved, {}).all()
-    assert not env.get_wrapper_attr("compute_truncated")(achieved, desired, {}).any()
+    assert not env.unwrapped.compute_truncated(achieved, desired, {}).any()
 
 
 def test_the_goal_is_not_in_the_observation(make):
@@ -80,9 +80,7 @@ def test_a_fault_and_an_invalid_scene_achieve_nothing(make, monkeypatch):
         block.place(tool)
         after, reward, terminated, _, info = env.step(np.zeros(5, np.float32))
     assert (reward, terminated, info["success"]) == (0, True, False)
-    assert not env.get_wrapper_attr("compute_terminated")(
-        after["achieved_goal"], after["desired_goal"], info
-    )
+    assert not env.unwrapped.compute_terminated(after["achieved_goal"], after["desired_goal"], info)
     before = env.reset(seed=0)[0]
 
     def fail(*_):
@@ -111,7 +109,7 @@ def test_what_has_no_goals_is_refused(make, config, message):
 
 
 def test_goals_of_another_length_are_refused(make):
-    compute = make(PUSHING).get_wrapper_attr("compute_reward")
+    compute = make(PUSHING).unwrapped.compute_reward
     with pytest.raises(
         ValueError, match=r"desired_goal \[\.\.\., 2\] is needed \(block x, block y\)"
     ):
