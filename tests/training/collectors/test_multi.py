@@ -49,6 +49,20 @@ def collecting(tmp_path):
         collection.close()
 
 
+@SLOW
+@pytest.mark.parametrize("name", KINDS)
+def test_workers_execute_a_part_of_each_chunk(collecting, name):
+    collection, _ = collecting(name, algorithm={"name": "flow_dagger", "batch_size": 8})
+    episodes = assert_each_transition_once([next(collection) for _ in range(5)])
+    pairs = [pair for steps in episodes.values() for pair in itertools.pairwise(steps)]
+    assert pairs
+    for before, after in pairs:
+        first, second = (step[keys.CARRIED, keys.ACTION_CHUNK] for step in (before, after))
+        is_second_part = bool(after[keys.STEP_COUNT] % 2)
+        assert torch.equal(first[1:], second[:-1]) == is_second_part
+        assert torch.equal(after[keys.ACTION], second[0])
+
+
 def test_environments_of_a_worker_step_in_its_process_by_default(collecting, monkeypatch):
     monkeypatch.setattr("ba_torchrl.envs.vector.make.available_cores", lambda: 16)
     collection, _ = collecting("multi_sync", num_envs=6, parallel=None)
