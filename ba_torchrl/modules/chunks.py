@@ -210,7 +210,9 @@ class ChunkPolicy(TensorDictModuleBase):
 
     def _noise(self, count: Tensor) -> Tensor:
         if exploration_type() is not ExplorationType.RANDOM:
-            return self.noise[count % len(self.noise)]
+            # an index without dimensions would be read as a number, which no export can trace
+            noise = F.embedding(count % len(self.noise), self.noise.flatten(1))
+            return noise.unflatten(-1, self.noise.shape[1:])
         shape = (*count.shape, *self.noise.shape[1:])
         drawn = torch.randn(shape, generator=self.generator, dtype=torch.float32, device="cpu")
         return drawn.to(self.noise)
