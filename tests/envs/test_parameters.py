@@ -15,6 +15,7 @@ from ba_torchrl.envs.observations import vector_names
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.sim.vision.camera_views import VIEWS
 from ba_torchrl.tasks.base import TASKS
+from ba_torchrl.training.config import ExperimentConfig
 from tests.specs import slow_except
 from tests.tasks.episodes import play
 
@@ -163,6 +164,19 @@ def test_environments_are_made_from_resolved_parameters(make):
     vector.close()
     named = resolve_env(PICKING, {}, modules=["json"])
     assert pickle.loads(pickle.dumps(named)).modules == named.changed(seed=1).modules == ("json",)
+    unset = resolve_env("open_loop/block_stacking", {"max_steps": None})
+    assert unset.changed(num_objects=8).config.max_steps == 14
+    assert resolved.given == {"obs_size": 32}
+
+
+def test_a_pickle_imports_the_modules_of_its_parts_first(monkeypatch):
+    imported = []
+    run = {"task": PICKING, "algorithm": {"name": "sac"}, "network": {"name": "cnn"}}
+    config = ExperimentConfig.parse({**run, "plugins": ["json"], "env": {"obs_size": 64}})
+    monkeypatch.setattr("ba_torchrl.envs.settings.import_modules", imported.append)
+    monkeypatch.setattr("ba_torchrl.training.config.load_plugins", imported.append)
+    assert pickle.loads(pickle.dumps(config)) == config
+    assert imported == [["json"], ("json",)]
 
 
 def test_the_step_limit_grows_with_the_number_of_blocks(make):

@@ -212,7 +212,9 @@ FERM = {
     ("changes", "message"),
     [
         ({"task": "close_loop/flying"}, "unknown task 'close_loop/flying'"),
+        ({"task": 3}, "task: Input should be a valid string"),
         ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
+        ({"env": 3}, "env: Input should be a valid dictionary"),
         ({"env": {"seed": 3}}, "set by the experiment"),
         ({"env": {"obs_type": "vec"}}, "obs_type"),
         ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
