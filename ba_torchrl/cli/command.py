@@ -187,7 +187,7 @@ class Command:
         name, _, text = word.lstrip("+").partition("=")
         try:
             OmegaConf.update(given, name, self._value(name, text), force_add=True)
-        except (YAMLError, OmegaConfBaseException) as error:
+        except (YAMLError, OmegaConfBaseException, RecursionError) as error:
             reason = getattr(error, "problem", None) or str(error).splitlines()[0]
             raise ConfigError(f"cannot read {word!r}: {reason}") from None
 

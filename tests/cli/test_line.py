@@ -101,6 +101,7 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
             "Did you mean 'close_loop/block_picking'? `ba-torchrl tasks` and",
         ),
         (["train", "env.workspace=[1,2"], "cannot read 'env.workspace=[1,2'"),
+        (["train", "seed=&a [*a]"], "cannot read 'seed=&a [*a]': "),
         (["train", "seed=010"], "seed: YAML does not read 010 as a decimal number; write it"),
         (["train", "env.workspace=[[1:30, 2]]"], "YAML does not read 1:30 as a decimal number"),
         (["train", "label=null"], "label: Input should be a valid string (got None)"),
