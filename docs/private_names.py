@@ -24,7 +24,6 @@ REASONS = {
     "LossModule._reduce_loss": "how TorchRL's losses apply masks and importance weights",
     "Module._apply": "torch moves and converts parameters by it, and shared ones stay shared",
     "MultiCollector._queue_len": "a batch is discarded if the only place of the queue is taken",
-    "PrioritizedSampler._alpha": "a saved exponent; the property would change the priorities",
     "PrioritizedSampler._init": "makes NumPy's trees where the native ones do not load",
     "PrioritizedSampler._min_tree": "TorchRL's methods use the trees by this name",
     "PrioritizedSampler._sum_tree": "TorchRL's methods use the trees by this name",
