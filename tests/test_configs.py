@@ -124,6 +124,13 @@ def test_other_algorithms_have_their_own_values_in_every_quick_start(name):
         assert config.algorithm == method(algorithm)
 
 
+def test_chunks_of_small_steps_are_shorter_than_an_episode():
+    config = experiment("small_steps")
+    assert config.env["dpos"] == 0.02
+    assert config.algorithm.name == "flow"
+    assert config.algorithm.horizon < 16
+
+
 @pytest.mark.parametrize(
     ("words", "part", "options"),
     [

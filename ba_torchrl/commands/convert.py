@@ -1,6 +1,7 @@
 """Write demonstrations in another library's format, with a card of their task and their entries.
 
 ba-torchrl convert demos/picking format=lerobot path=exports/picking
+ba-torchrl convert demos/picking format=lerobot path=exports/seen 'cameras=[rgb,wrist_rgb]'
 ba-torchrl convert demos/picking format=minari path=exports/picking-v0    # an id of Minari
 ba-torchrl convert demos/picking format=hdf5 path=exports/picking.hdf5    # robomimic
 ba-torchrl convert demos/picking format=zarr path=exports/picking.zarr    # Diffusion Policy
@@ -26,6 +27,10 @@ class Settings(PluginSettings):
     """Of the library."""
     path: NewPath
     """New file or folder."""
+    keys: list[Text] | None = None
+    """Observations that are written; null for all of them."""
+    cameras: list[Text] | None = None
+    """Of LeRobot's format: images that policies see as pictures; null for all of one size."""
 
 
 def main(settings: Settings) -> None:
@@ -44,6 +49,8 @@ def main(settings: Settings) -> None:
         source=metadata["source"],
         policy=metadata.get("policy", ""),
         expert_version=metadata["expert_version"],
+        observed=settings.keys,
+        cameras=settings.cameras,
     )
     path = Path(settings.path)
     files = [path] if path.is_file() else [file for file in path.rglob("*") if file.is_file()]

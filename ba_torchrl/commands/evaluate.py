@@ -3,20 +3,33 @@
 ba-torchrl evaluate runs/my-run episodes=100 video=my-run.mp4
 ba-torchrl evaluate runs/my-run which=latest
 ba-torchrl evaluate close_loop/block_picking       # that which the package ships
+ba-torchrl evaluate policy=lerobot:outputs/act episodes=500 result=runs/act/seed0
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pydantic import model_validator
+from typing_extensions import Self
+
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, PluginSettings, Seed, Text, VectorSettings, VideoFile
-from ba_torchrl.core.config import FIRST_TEST_SEED, LocalPath, Which
+from ba_torchrl.cli.types import (
+    Count,
+    NewPath,
+    PluginSettings,
+    Seed,
+    Text,
+    VectorSettings,
+    VideoFile,
+)
+from ba_torchrl.core.config import FIRST_TEST_SEED, LEROBOT, LocalPath, Which
 from ba_torchrl.record.logging import progress_bar
-from ba_torchrl.record.results import CITABLE_EPISODES, PolicyTest
+from ba_torchrl.record.results import CITABLE_EPISODES, PolicyTest, write_result
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
+    from ba_torchrl.training.lerobot_policy import LeRobotPolicy
     from ba_torchrl.training.policy import TrainedPolicy
 
 
@@ -25,7 +38,7 @@ class PolicySettings(PluginSettings):
 
     policy: LocalPath
     """A run folder, one of the checkpoints in it, a .safetensors file, or a task whose policy the
-    package ships."""
+    package ships; for evaluate and play also lerobot:FOLDER, what LeRobot trained on an export."""
     which: Which = "best"
     """Of a run folder: the checkpoint with the best evaluation, or the latest."""
     device: Text = "auto"
@@ -48,16 +61,30 @@ class Settings(EpisodeSettings):
     """A file such as evaluation.mp4 or evaluation.gif."""
     video_episodes: Count = 5
     """Episodes in the video."""
+    result: NewPath | None = None
+    """Of a policy of LeRobot: folder for the result, which the leaderboard and reports read."""
+
+    @model_validator(mode="after")
+    def _check_result(self) -> Self:
+        if self.result is not None and not self.policy.startswith(LEROBOT):
+            raise ValueError("result: of policies of LeRobot only; a run has its own")
+        if self.result is not None and self.seed is not None:
+            raise ValueError("result: has the episodes of the protocol; leave out seed")
+        return self
 
 
 def main(settings: Settings) -> None:
     """Play greedy episodes with a policy."""
     from ba_torchrl import load_policy
     from ba_torchrl.training.evaluation import record_episodes
+    from ba_torchrl.training.lerobot_policy import load_lerobot, result_of
     from ba_torchrl.training.protocol import PROTOCOL
 
-    policy = load_policy(settings.policy, settings.which, settings.device)
-    resolved = policy.config.env
+    policy: TrainedPolicy | LeRobotPolicy
+    if settings.policy.startswith(LEROBOT):
+        policy = load_lerobot(settings.policy.removeprefix(LEROBOT), settings.device)
+    else:
+        policy = load_policy(settings.policy, settings.which, settings.device)
     seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
     found = play(policy, settings, seed)
     text = success_text(found.success_rate, found.episodes, policy.task)
@@ -76,19 +103,24 @@ def main(settings: Settings) -> None:
     elif not found.is_citable:
         episodes += f"; not citable: fewer than {CITABLE_EPISODES} episodes"
     print(f"  episodes  {episodes}")
+    if settings.result is not None:
+        write_result(settings.result, result_of(policy, found))
+        print(f"  result    {settings.result}")
     if settings.video is not None:
-        frames = record_episodes(resolved, policy, settings.video_episodes, seed)
-        print(f"  video     {write_video(settings.video, frames, fps=resolved.video_fps)}")
+        frames = record_episodes(policy.resolved_env, policy, settings.video_episodes, seed)
+        print(
+            f"  video     {write_video(settings.video, frames, fps=policy.resolved_env.video_fps)}"
+        )
 
 
 def play(
-    policy: TrainedPolicy, settings: EpisodeSettings, seed: int = FIRST_TEST_SEED
+    policy: TrainedPolicy | LeRobotPolicy, settings: EpisodeSettings, seed: int = FIRST_TEST_SEED
 ) -> PolicyTest:
     """Play greedy episodes in new environments, by default those of the protocol."""
     from ba_torchrl.training.protocol import run_test
 
     with (
-        settings.make_env(policy.config.env) as env,
+        settings.make_env(policy.resolved_env) as env,
         progress_bar(total=settings.episodes, unit="episode") as bar,
     ):
         updates, episodes = policy.updates, settings.episodes

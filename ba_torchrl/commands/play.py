@@ -13,13 +13,14 @@ from typing import TYPE_CHECKING, ClassVar
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import Count, EnvSettings, Fps, TaskId, VideoFile
-from ba_torchrl.core.config import LocalPath
+from ba_torchrl.core.config import LEROBOT, LocalPath
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.record.video import write_video
 
 if TYPE_CHECKING:
     from ba_torchrl.envs.policies import Policy
+    from ba_torchrl.training.policy import TrainedPolicy
 
 
 class Settings(EnvSettings):
@@ -30,7 +31,7 @@ class Settings(EnvSettings):
     """Id of the task; a policy of a run knows its own."""
     policy: LocalPath = "expert"
     """expert, random, trained (the policy that the package ships), or a run folder, a checkpoint or
-    a .safetensors file."""
+    a .safetensors file, or lerobot:FOLDER, a policy that LeRobot trained on an export."""
     episodes: Count = 1
     """Their number."""
     video: VideoFile | None = "play.mp4"
@@ -73,16 +74,25 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
         from ba_torchrl.envs.policies import expert_policy  # imports torch
 
         return resolved, expert_policy if is_expert else None
+    if settings.policy.startswith(LEROBOT):
+        from ba_torchrl.training.lerobot_policy import load_lerobot
+
+        policy = load_lerobot(settings.policy.removeprefix(LEROBOT))
+    else:
+        policy = _trained(settings)
+    if settings.task not in (None, policy.task):
+        raise ConfigError(f"task: {settings.policy} is a policy of {policy.task}")
+    return policy.resolved_env.changed(**settings.env), policy
+
+
+def _trained(settings: Settings) -> TrainedPolicy:
     from ba_torchrl import load_policy
 
     try:
-        policy = load_policy(settings.task if settings.policy == "trained" else settings.policy)
+        return load_policy(settings.task if settings.policy == "trained" else settings.policy)
     except UnknownNameError as error:
         known = ("expert", "random", "trained", *error.known)
         raise UnknownNameError(error.kind, error.name, known, error.hint) from None
-    if settings.task not in (None, policy.task):
-        raise ConfigError(f"task: {settings.policy} is a policy of {policy.task}")
-    return policy.config.env.changed(**settings.env), policy
 
 
 COMMAND = Command(main, Settings, positional="task")

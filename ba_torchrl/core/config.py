@@ -91,6 +91,8 @@ def expanded(path: str | Path) -> str:
     return found
 
 
+LEROBOT = "lerobot:"
+"""Before the folder of a policy that LeRobot trained."""
 LocalPath = Annotated[str, Field(min_length=1), AfterValidator(expanded)]
 """The type of every setting that is the path of a file or folder."""
 

@@ -18,7 +18,7 @@ from tensordict import NonTensorStack, TensorDict, TensorDictBase
 from ba_torchrl import __version__
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import expanded
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.demonstrations.episodes import mean_return, success_rate
 from ba_torchrl.demonstrations.formats.base import (
     FORMATS,
@@ -42,6 +42,7 @@ from ba_torchrl.demonstrations.formats.minari import check_neighbours
 from ba_torchrl.demonstrations.mapping import MappedFile, entry_specs
 from ba_torchrl.envs.description import summary
 from ba_torchrl.envs.factory import make
+from ba_torchrl.envs.lerobot import PolicyView
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.tasks.base import versions_of
 
@@ -65,6 +66,8 @@ def export_demonstrations(
     source: str = "expert",
     policy: str = "",
     expert_version: int | None = None,
+    observed: Sequence[str] | None = None,
+    cameras: Sequence[str] | None = None,
 ) -> None:
     """Write episodes for another library, with a card beside them.
 
@@ -79,10 +82,14 @@ def export_demonstrations(
         source: how the demonstrations were made, as for `save_demonstrations`.
         policy: which acted, in words.
         expert_version: of the task's expert when they were made; None for the present one.
+        observed: keys of the observations that are written; None for all of them.
+        cameras: of LeRobot's format, keys of the images that are pictures for policies; None for
+            all images of one size.
 
     Raises:
-        ConfigError: the format is unknown or its package missing, ``path`` exists or has not the
-            format's suffix, or an episode lacks an entry or has another shape.
+        ConfigError: the format is unknown, its package missing or it has no pictures, ``path``
+            exists or has not the format's suffix, an episode lacks an entry or has another shape,
+            or a key or a camera is not observed.
         ValueError: there are no episodes.
     """
     form, path = FORMATS[format], Path(expanded(path))
@@ -90,8 +97,12 @@ def export_demonstrations(
         raise ValueError("there are no episodes to export")
     if form.suffixes and path.suffix.lower() not in form.suffixes:
         raise ConfigError(f"{path} could not be read back; end the path in {form.suffixes[0]}")
+    if cameras is not None and not form.has_pictures:
+        raise ConfigError(f"cameras: the format {format} has none; choose images by keys")
     check_episodes(episodes, task, env)
-    roles = _roles(episodes[0])
+    roles = _chosen(_roles(episodes[0]), observed)
+    with closing(make(task, **{**env, "seed": 0})) as made:
+        pictures = PolicyView(made, list(roles), cameras).images if form.has_pictures else {}
     arrays = [_to_arrays(episode, roles) for episode in episodes]
     entries = {key: _entry(key, role, arrays[0][key]) for key, role in roles.items()}
     shapes = {key: entry.shape for key, entry in entries.items()}
@@ -100,6 +111,8 @@ def export_demonstrations(
             if each[key].shape[1:] != shape:
                 found = f"the shape {list(each[key].shape[1:])}"
                 raise ConfigError(f"episode {number}: {key} has {found}, needed {list(shape)}")
+    for key in pictures:
+        entries[key] = entries[key].model_copy(update={"is_picture": True})
     names = form.names(entries)
     for key, entry in entries.items():
         if entry.dtype == "str" and key != keys.INSTRUCTION and not form.holds_texts:
@@ -131,9 +144,22 @@ def export_demonstrations(
         instructions=list(filter(None, texts))[:_MOST_INSTRUCTIONS],
         versions={"ba_torchrl": __version__, form.package: _version(form.package)},
         entries=entries,
+        left_out=sorted(_roles(episodes[0]).keys() - roles.keys()),
+        cameras=None if cameras is None else list(cameras),
     )
     write_file(form, path, arrays, card)
     check_neighbours(path.resolve().parent)
+
+
+def _chosen(roles: dict[str, Role], observed: Sequence[str] | None) -> dict[str, Role]:
+    """Return the roles of actions, results and the observations that are chosen."""
+    if observed is None:
+        return roles
+    known = [key for key, role in roles.items() if role == "observation"]
+    for key in observed:
+        if key not in known:
+            raise UnknownNameError("observation", key, known)
+    return {key: role for key, role in roles.items() if key not in known or key in observed}
 
 
 def check_episodes(episodes: Sequence[TensorDictBase], task: str, env: dict[str, Any]) -> None:
@@ -234,6 +260,14 @@ def _exported(
             f"(demonstrations_mapping). It holds {_listed(read_file(form, path))}"
         )
     check_same_environment(path, task, env, vars(card))
+    if card.left_out:
+        with closing(make(task, **env)) as made:
+            missing = sorted(entry_specs(made).keys() - card.entries.keys())
+        if missing:
+            raise ConfigError(
+                f"{path} was exported without {', '.join(missing)}, which {task} observes: export "
+                "it without keys"
+            )
     check_files(path, card)
     episodes = read_file(form, path)
     if len(episodes) != card.episodes:

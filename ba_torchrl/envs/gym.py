@@ -67,6 +67,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
         if render_mode == "human":
             config = {**config, "render": True}
         self.render_mode = render_mode
+        self._warned_of_options = False
         self.torchrl_env = make(resolve_env(task, config, modules=register_modules))
         """The same environment for TorchRL; stepping it steps this one."""
         specs = self.torchrl_env.observation_spec
@@ -115,10 +116,11 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
     ) -> tuple[Observation, dict[str, Any]]:
         """Start an episode: the first one of ``seed``, or the next one of the current seed."""
         super().reset(seed=seed)
-        if options:
-            raise ConfigError(
-                f"reset takes no options, got {', '.join(map(repr, options))}; parameters are "
-                "given to gymnasium.make"
+        if options and not self._warned_of_options:
+            self._warned_of_options = True
+            gymnasium.logger.warn(
+                f"reset takes no options, {', '.join(map(repr, options))} has no effect; "
+                "parameters are given to gymnasium.make"
             )
         if seed is not None:
             self.torchrl_env.set_seed(seed, static_seed=True)

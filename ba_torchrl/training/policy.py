@@ -32,7 +32,7 @@ from ba_torchrl.core.files import atomic_file, errors_naming, header_texts, json
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
-from ba_torchrl.envs.settings import resolve_env
+from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.record.results import (
     POLICY_RESULT,
     POLICY_SUFFIX,
@@ -81,7 +81,96 @@ class _Card(BaseModel, extra="ignore"):
     expert_version: int | None = None
 
 
-class TrainedPolicy(TensorDictModuleBase):
+class EnvPolicy(TensorDictModuleBase):
+    """A policy that knows the environment of its training, and checks others.
+
+    Subclasses set ``in_keys``, ``out_keys``, `shapes` and `resolved_env`.
+    """
+
+    shapes: Mapping[NestedKey, tuple[int, ...]]
+    """Shape of each image and vector that the policy reads, without batch dimensions."""
+    resolved_env: ResolvedEnv
+    """The environment of the training."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._warned: set[str] = set()
+
+    @property
+    def task(self) -> str:
+        """Id of the task."""
+        return self.resolved_env.task_id
+
+    @property
+    def env_config(self) -> dict[str, Any]:
+        """Keywords for `ba_torchrl.make` and `ba_torchrl.make_vector_env`, besides the task."""
+        usual = resolve_env(self.task, {}).config
+        return {
+            name: value
+            for name, value in self.resolved_env.config
+            if value != getattr(usual, name) and name not in SET_BY_THE_EXPERIMENT
+        }
+
+    def make_env(self, **changes: Any) -> BulletArmEnv:
+        """Make the environment that the policy was trained in.
+
+        Args:
+            changes: fields of `ba_torchrl.core.env_config.EnvConfig` with other values, such as
+                ``seed=0``.
+        """
+        return make(self.task, **{**self.env_config, **changes})
+
+    def check_env(self, env: EnvBase) -> None:
+        """Check that an environment observes what the policy reads and takes its actions.
+
+        Another task, or images with other content, are logged as a warning, once. Other parameters,
+        such as the robot, may differ. Of environments that are not `make`'s or `make_vector_env`'s,
+        with or without transforms, only the observations are known.
+
+        Raises:
+            ConfigError: it observes other shapes, or its actions have another meaning.
+        """
+        specs = env.observation_spec
+        observed = {key: specs[key].shape for key in self.shapes if key in specs.keys(True)}
+        self._check_observed(self.shapes, observed)
+        while isinstance(env, TransformedEnv):
+            env = env.base_env
+        here, trained = vars(env).get("resolved"), self.resolved_env
+        if here is None:
+            return
+        if here.actions != trained.actions:
+            raise ConfigError(
+                f"the policy of {self.task} gives {trained.actions}, the environment takes "
+                f"{here.actions}: {_WAY_OUT}"
+            )
+        changes = [("task", self.task, here.task_id)]
+        changes += [
+            (name, getattr(trained.config, name), getattr(here.config, name)) for name in _OF_IMAGES
+        ]
+        found = ", ".join(f"{name} {new}, not {old}" for name, old, new in changes if new != old)
+        if found and found not in self._warned:
+            self._warned.add(found)
+            logger.warning("the policy was trained in another environment; here: %s", found)
+
+    def _check_observed(
+        self, wanted: Iterable[NestedKey], observed: Mapping[NestedKey, torch.Size]
+    ) -> None:
+        """Check that entries are observed, with shapes that end in the shapes of training."""
+        if missing := [key for key in wanted if key not in observed]:
+            raise ConfigError(
+                f"the policy of {self.task} reads {', '.join(map(str, missing))}, which is not "
+                f"observed: {_WAY_OUT}"
+            )
+        others = [
+            f"{key} of shape {list(shape)}, and this is {list(observed[key][-len(shape) :])}"
+            for key, shape in self.shapes.items()
+            if observed[key][-len(shape) :] != shape
+        ]
+        if others:
+            raise ConfigError(f"the policy of {self.task} reads {'; '.join(others)}: {_WAY_OUT}")
+
+
+class TrainedPolicy(EnvPolicy):
     """A greedy policy in evaluation mode: no gradients, no exploration, constant weights.
 
     It refuses observations of other shapes than in training. The actions and the task of an
@@ -114,67 +203,10 @@ class TrainedPolicy(TensorDictModuleBase):
         vectors = {key: (length,) for key, length in learner.vectors.items()}
         known = {**images, **vectors, keys.HOLDING: (1,)}
         self.shapes = {key: known[key] for key in self.in_keys if key in known}
-        """Shape of each image and vector that the policy reads, without batch dimensions."""
-        self._warned: set[str] = set()
+        self.resolved_env = config.env
         self.config, self.updates, self.source = config, updates, source
         self.versions, self.result = versions, result
         self.eval()
-
-    @property
-    def task(self) -> str:
-        """Id of the task."""
-        return self.config.task
-
-    @property
-    def env_config(self) -> dict[str, Any]:
-        """Keywords for `ba_torchrl.make` and `ba_torchrl.make_vector_env`, besides the task."""
-        usual = resolve_env(self.task, {}).config
-        return {
-            name: value
-            for name, value in self.config.env.config
-            if value != getattr(usual, name) and name not in SET_BY_THE_EXPERIMENT
-        }
-
-    def make_env(self, **changes: Any) -> BulletArmEnv:
-        """Make the environment that the policy was trained in.
-
-        Args:
-            changes: fields of `ba_torchrl.core.env_config.EnvConfig` with other values, such as
-                ``seed=0``.
-        """
-        return make(self.task, **{**self.env_config, **changes})
-
-    def check_env(self, env: EnvBase) -> None:
-        """Check that an environment observes what the policy reads and takes its actions.
-
-        Another task, or images with other content, are logged as a warning, once. Other parameters,
-        such as the robot, may differ. Of environments that are not `make`'s or `make_vector_env`'s,
-        with or without transforms, only the observations are known.
-
-        Raises:
-            ConfigError: it observes other shapes, or its actions have another meaning.
-        """
-        specs = env.observation_spec
-        observed = {key: specs[key].shape for key in self.shapes if key in specs.keys(True)}
-        self._check_observed(self.shapes, observed)
-        while isinstance(env, TransformedEnv):
-            env = env.base_env
-        here, trained = vars(env).get("resolved"), self.config.env
-        if here is None:
-            return
-        if here.actions != trained.actions:
-            raise ConfigError(
-                f"the policy of {self.task} gives {trained.actions}, the environment takes "
-                f"{here.actions}: {_WAY_OUT}"
-            )
-        changes = [("task", self.task, here.task_id)]
-        changes += [
-            (name, getattr(trained.config, name), getattr(here.config, name)) for name in _OF_IMAGES
-        ]
-        found = ", ".join(f"{name} {new}, not {old}" for name, old, new in changes if new != old)
-        if found and found not in self._warned:
-            self._warned.add(found)
-            logger.warning("the policy was trained in another environment; here: %s", found)
 
     @torch.no_grad()
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
@@ -194,23 +226,6 @@ class TrainedPolicy(TensorDictModuleBase):
             found = self.policy(seen).select(*self.out_keys)
         found[keys.ACTION] = found[keys.ACTION].float()
         return tensordict.update(found.to(tensordict.device or device))
-
-    def _check_observed(
-        self, wanted: Iterable[NestedKey], observed: Mapping[NestedKey, torch.Size]
-    ) -> None:
-        """Check that entries are observed, with shapes that end in the shapes of training."""
-        if missing := [key for key in wanted if key not in observed]:
-            raise ConfigError(
-                f"the policy of {self.task} reads {', '.join(map(str, missing))}, which is not "
-                f"observed: {_WAY_OUT}"
-            )
-        others = [
-            f"{key} of shape {list(shape)}, and this is {list(observed[key][-len(shape) :])}"
-            for key, shape in self.shapes.items()
-            if observed[key][-len(shape) :] != shape
-        ]
-        if others:
-            raise ConfigError(f"the policy of {self.task} reads {'; '.join(others)}: {_WAY_OUT}")
 
     def __repr__(self) -> str:
         return f"TrainedPolicy({self.task}, {self.config.label}, update {self.updates})"

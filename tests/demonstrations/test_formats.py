@@ -36,6 +36,7 @@ from ba_torchrl.demonstrations.formats.hdf5 import _split
 from ba_torchrl.demonstrations.mapping import with_results
 from ba_torchrl.demonstrations.plausibility import contradictions
 from ba_torchrl.envs.settings import resolve_env
+from tests.envs.test_lerobot import check_features
 from tests.tasks.episodes import demonstrations
 from tests.training.test_limits import limited
 
@@ -313,13 +314,128 @@ def test_zarr_has_the_layout_of_diffusion_policy(episodes, tmp_path):
 
 def test_lerobot_has_its_names(episodes, tmp_path):
     pytest.importorskip("lerobot")
-    exported(tmp_path, episodes, "lerobot")
-    info = json.loads((tmp_path / PATHS["lerobot"] / "meta/info.json").read_text())
-    features = info["features"]
-    assert features["observation.state"]["shape"] == [8]
-    assert features["observation.images.wrist_rgb"]["dtype"] == "image"
-    assert features["observation.images.depth"]["info"]["is_depth_map"]
-    assert {"action", "next.reward", "next.done", "next.success"} <= features.keys()
+    path = exported(tmp_path, episodes, "lerobot")
+    features = json.loads((path / "meta/info.json").read_text())["features"]
+    assert features["observation.state"]["names"] == ["holding", "empty"]
+    assert features["observation.images.depth"]["shape"] == [3, SIZE, SIZE]
+    assert features["action"]["names"] == ["gripper", "x", "y", "z", "yaw"]
+    assert {"next.reward", "next.done", "next.success"} <= features.keys()
+    assert not [
+        folder for folder in path.rglob("*") if folder.is_dir() and not any(folder.iterdir())
+    ]
+
+
+class Recorder:
+    """LeRobot's writer: it refuses the frames that LeRobot 0.6 refuses."""
+
+    def __init__(self):
+        self.frames, self.ends, self.were_silent = [], [], []
+
+    def create(self, *, repo_id, fps, features, root, robot_type, use_videos, video_backend):
+        self.features = features
+        (root / "meta").mkdir(parents=True)
+        (root / "images/observation.images.depth").mkdir(parents=True)
+        (root / "meta/info.json").write_text("{}")
+        return self
+
+    def add_frame(self, frame):
+        assert frame.keys() == {*self.features, "task"}
+        for name, feature in self.features.items():
+            assert frame[name].shape == feature["shape"], name
+            dtype = "uint8" if feature["dtype"] == "image" else feature["dtype"]
+            assert frame[name].dtype == dtype, name
+        self.frames.append(frame)
+
+    def save_episode(self):
+        self.ends.append(len(self.frames))
+        self.were_silent.append(not self.bars)
+
+    bars = True
+
+    def are_progress_bars_disabled(self):
+        return not self.bars
+
+    def disable_progress_bars(self):
+        self.bars = False
+
+    def enable_progress_bars(self):
+        self.bars = True
+
+    def finalize(self):
+        assert self.ends
+
+
+@pytest.fixture
+def recorder(monkeypatch):
+    recorder = Recorder()
+    module = SimpleNamespace(LeRobotDataset=recorder)
+    monkeypatch.setitem(sys.modules, "lerobot.datasets.lerobot_dataset", module)
+    monkeypatch.setitem(sys.modules, "datasets", recorder)
+    return recorder
+
+
+def test_lerobot_is_given_what_its_policies_train_on(collected, tmp_path, recorder):
+    path = exported(tmp_path, collected, "lerobot")
+    check_features({name: each for name, each in recorder.features.items() if "info" in each})
+    steps = [len(episode) for episode in collected]
+    assert recorder.ends == [steps[0], sum(steps)]
+    assert recorder.were_silent == [True, True]
+    assert recorder.bars
+    first = recorder.frames[0]
+    assert first["task"] == "pick up the red block"
+    np.testing.assert_array_equal(first["action"], collected[0]["action"][0])
+    assert sorted(file.name for file in path.iterdir()) == [
+        "README.md",
+        "card.json",
+        "meta",
+        "observations.npz",
+    ]
+    page = (path / "README.md").read_text()
+    for words in (
+        "| `action` | gripper, x, y, z, yaw | gripper: 1 opens, -1 closes; x, y, z: 1 moves by",
+        "| `observation.images.depth` | 3 x 64 x 64 | 0 m (0) to 0.39 m (255) | workspace, rows +x",
+        "--policy.type=act --policy.chunk_size=16",
+        "--policy.type=diffusion --policy.horizon=16",
+        "--env.task=close_loop/block_picking",
+        """--env.parameters='{"obs_size": 64}'""",
+        "ba-torchrl evaluate policy=lerobot:",
+    ):
+        assert words in page
+
+
+def test_rows_of_the_file_beside_that_do_not_fit_are_refused(collected, tmp_path, recorder):
+    path = exported(tmp_path, collected, "lerobot")
+    without_checksums(path)
+    start, read = 0, []
+    for end in recorder.ends:
+        frames, start = recorder.frames[start:end], end
+        read.append({name: np.array([frame[name] for frame in frames]) for name in frames[0]})
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(type(FORMATS["lerobot"]), "read", lambda *_: read)
+        assert_equal(load_demonstrations(path, task=TASK, env=ENV), collected)
+        read[0]["action"] = read[0]["action"][:-1]
+        with pytest.raises(ConfigError, match=r"observations.npz has \d+ rows of exact\."):
+            load_demonstrations(path, task=TASK, env=ENV)
+
+
+def test_chosen_observations_and_pictures(collected, tmp_path, recorder):
+    path = exported(tmp_path, collected, "hdf5", observed=["depth"])
+    with h5py.File(path) as file:
+        assert list(file["data/demo_0/obs"]) == ["depth"]
+    with pytest.raises(ConfigError, match=r"was exported without holding, which .* observes"):
+        load_demonstrations(path, task=TASK, env=ENV)
+    for name, changes, message in (
+        ("zarr", {"cameras": ["depth"]}, "cameras: the format zarr has none; choose images by"),
+        ("zarr", {"observed": ["rgb"]}, r"unknown observation 'rgb'\. Known: depth, holding"),
+        ("lerobot", {"cameras": ["holding"]}, r"unknown camera 'holding'\. Known: depth"),
+        ("lerobot", {"observed": ["depth"], "cameras": ["rgb"]}, "unknown camera 'rgb'"),
+        ("lerobot", {"observed": []}, "there is nothing that a policy of LeRobot reads"),
+    ):
+        with pytest.raises(ConfigError, match=message):
+            exported(tmp_path, collected, name, **changes)
+    exported(tmp_path, collected, "lerobot", observed=["holding"], cameras=[])
+    assert "observation.state" in recorder.features
+    assert not [name for name in recorder.features if "images" in name]
 
 
 def edit_table(file, change):

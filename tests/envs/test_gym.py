@@ -96,9 +96,14 @@ def test_wrong_keywords_are_errors_with_the_allowed_ones(make, config, message):
         make(**config)
 
 
-def test_reset_takes_no_options(make):
-    with pytest.raises(ConfigError, match="'block'"):
-        make().reset(options={"block": 1})
+def test_options_of_other_libraries_have_no_effect_and_one_warning(make):
+    env = make()
+    with pytest.warns(UserWarning, match="'block' has no effect"):
+        first, _ = env.reset(seed=0, options={"block": 1})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        again, _ = env.reset(seed=0, options={"block": 1})
+    np.testing.assert_array_equal(first["depth"], again["depth"])
 
 
 # -- episodes --------------------------------------------------------------------------------

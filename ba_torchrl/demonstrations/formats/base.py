@@ -78,6 +78,7 @@ Role = Literal["observation", "action", "result"]
 RESULTS = (keys.REWARD, keys.TERMINATED, keys.TRUNCATED, keys.SUCCESS)
 """Results of a step that files hold; ``done`` is terminated or truncated."""
 _LAST_FILE = "last_observations.safetensors"
+_EXACT_FILE = "observations.npz"
 
 
 class Entry(StrictModel):
@@ -91,6 +92,8 @@ class Entry(StrictModel):
     """Of one step, channels of images first."""
     file_shape: tuple[int, ...] | None = None
     """Of one step in the file; None in cards that do not say it."""
+    is_picture: bool = False
+    """Whether policies of the library see it as a picture."""
 
     @property
     def is_image(self) -> bool:
@@ -131,6 +134,10 @@ class Card(StrictModel):
     """Of the packages that wrote the file."""
     entries: dict[str, Entry]
     """By key of the TensorDict."""
+    left_out: list[str] = Field(default_factory=list)
+    """Keys of the observations that were not chosen."""
+    cameras: list[str] | None = None
+    """Keys of the images that are pictures, if they were chosen."""
     checksums: dict[str, tuple[int, int]] = Field(default_factory=dict)
     """Length and CRC-32 of each file, by its path below the folder; of a single file, by "."."""
 
@@ -184,7 +191,7 @@ class Card(StrictModel):
             lines.append(
                 f"| `{entry.name}` | {entry.role} `{key}` | {entry.dtype} | {list(shape)} |"
             )
-        return "\n".join(lines) + "\n"
+        return "\n".join(lines) + "\n" + FORMATS[self.format].page(self)
 
 
 class Format(ABC):
@@ -200,6 +207,8 @@ class Format(ABC):
     """Prefix of the entries that have a row before the first step, as observations have."""
     tag: ClassVar[str] = "BA-TorchRL"
     """Of data sets of this format on the Hugging Face Hub."""
+    has_pictures: ClassVar[bool] = False
+    """Whether images are also pictures for policies, which ``cameras`` chooses."""
     suffixes: ClassVar[tuple[str, ...]] = ()
     """Of its files, one of which a path must have; none for folders."""
     package: ClassVar[str]
@@ -220,6 +229,14 @@ class Format(ABC):
         if self.channels_last and entry.is_image:
             return (*entry.shape[1:], entry.shape[0])
         return entry.shape
+
+    def is_beside(self, entry: Entry) -> bool:
+        """Return whether the values of an entry are in a file of our own, without loss."""
+        return False
+
+    def page(self, card: Card) -> str:
+        """Return what the page of the card says of this format only."""
+        return ""
 
     def has_row_before_first_step(self, name: str) -> bool:
         """Return whether an entry of that name may have a row before the first step."""
@@ -259,11 +276,15 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
     """Write episodes with their card; they appear under their name when all is on the disk."""
     import torch
 
-    named = []
+    named: list[Arrays] = []
+    beside: list[Arrays] = []
     for arrays in episodes:
         moved = {}
+        beside.append({})
         for key, values in arrays.items():
             entry = card.entries[key]
+            if form.is_beside(entry):
+                beside[-1][entry.name] = values
             is_moved = form.channels_last and entry.is_image
             moved[entry.name] = np.moveaxis(values, 1, -1) if is_moved else values
         named.append(moved)
@@ -273,13 +294,19 @@ def write_file(form: Format, path: Path, episodes: Sequence[Arrays], card: Card)
             observed = [
                 entry.name
                 for entry in card.entries.values()
-                if entry.role == "observation" and entry.dtype != "str"
+                if entry.role == "observation"
+                and entry.dtype != "str"
+                and not form.is_beside(entry)
             ]
             last = {
                 name: torch.from_numpy(np.ascontiguousarray([arrays[name][-1] for arrays in named]))
                 for name in observed
             }
-            write_tensors(scratch / _LAST_FILE, last)
+            if last:
+                write_tensors(scratch / _LAST_FILE, last)
+        if beside[0]:
+            rows = {name: np.concatenate([each[name] for each in beside]) for name in beside[0]}
+            np.savez_compressed(scratch / _EXACT_FILE, **rows)
         card = card.model_copy(update={"checksums": _checksums(scratch)})
         write_text(page_file(scratch), card.to_markdown())
         write_text(card_file(scratch), card.model_dump_json(indent=1) + "\n")
@@ -334,6 +361,9 @@ def read_file(form: Format, path: Path) -> list[StoredArrays]:
         episodes = form.read(path)
         last_file = path / _LAST_FILE
         last = load_file(last_file) if path.is_dir() and last_file.exists() else {}
+        if path.is_dir() and (path / _EXACT_FILE).exists():
+            with np.load(path / _EXACT_FILE) as beside:
+                episodes = _with_rows(episodes, {name: beside[name] for name in beside.files})
         return [
             {
                 name: rows_of(values).then(last[name][i : i + 1]) if name in last else values
@@ -345,6 +375,22 @@ def read_file(form: Format, path: Path) -> list[StoredArrays]:
         raise
     except Exception as error:  # libraries raise anything at files that are not theirs
         raise ConfigError(f"{path} cannot be read: {_first_line(error)}") from error
+
+
+def _with_rows(episodes: Sequence[StoredArrays], beside: Arrays) -> list[StoredArrays]:
+    """Return episodes with the entries of the file beside, which have a row more than actions."""
+    lengths = [len(np.asarray(arrays[keys.ACTION])) + 1 for arrays in episodes]
+    for name, rows in beside.items():
+        if len(rows) != sum(lengths):
+            raise ConfigError(
+                f"{_EXACT_FILE} has {len(rows)} rows of {name}, needed {sum(lengths)}: one for "
+                "each step, and one after each episode"
+            )
+    ends = np.cumsum(lengths)
+    return [
+        {**arrays, **{name: rows[end - length : end] for name, rows in beside.items()}}
+        for arrays, end, length in zip(episodes, ends, lengths, strict=True)
+    ]
 
 
 @contextmanager

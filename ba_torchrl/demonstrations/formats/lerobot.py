@@ -3,33 +3,44 @@
 from __future__ import annotations
 
 import functools
+import json
 import os
+import shlex
 import sys
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, contextmanager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError
 from ba_torchrl.demonstrations.formats.base import FORMATS, Arrays, Card, Entry, Format
+from ba_torchrl.envs.settings import resolve_env
 
-_STATES = ("proprio", keys.OBSERVATION, keys.HOLDING)
-"""Keys of which the first one there is ``observation.state``."""
-_STATE, _TASK, _DONE = "observation.state", "task", "next.done"
+if TYPE_CHECKING:
+    from ba_torchrl.envs.lerobot import PolicyView
+
+_TASK, _DONE = "task", "next.done"
 _VIDEO_BACKEND = "pyav"
 """The decoder that needs no FFmpeg on the system."""
 _LOCAL = "local"
 """No version of LeRobot's format: of such a revision, LeRobot does not ask the Hub for versions."""
 _OWN = ("index", "episode_index", "frame_index", "timestamp", "task_index")
 """Entries that LeRobot adds."""
+_PREFIXES = {"observation": "exact.", "action": "", "result": "next."}
 
 
 class LeRobot(Format):
-    """Parquet files with images in them: PNG for colours, float32 TIFF for depth."""
+    """Parquet files: vectors of float32 and PNG pictures, which LeRobot's policies train on.
+
+    The observations themselves are in a file beside, with the one after the last action; pictures
+    that are colours are in the data set alone.
+    """
 
     has_last_observation = False
+    has_pictures = True
     package = "lerobot"
     tag = "LeRobot"
     hint = ". LeRobot needs Python 3.12 or later"
@@ -39,43 +50,62 @@ class LeRobot(Format):
         return os.path.isfile(path / "meta" / "info.json")
 
     def names(self, entries: Mapping[str, Entry]) -> dict[str, str]:
-        """Return names: ``observation.state``, ``observation.images.NAME`` and ``next.reward``."""
-        state = next((key for key in _STATES if key in entries), None)
-        fixed = {state: _STATE, keys.INSTRUCTION: _TASK}
-        prefixes = {"observation": "observation.", "action": "", "result": "next."}
+        """Return names such as ``observation.images.rgb``, ``exact.depth`` and ``next.reward``."""
+        from ba_torchrl.envs.lerobot import IMAGES  # imports torch
+
         return {
-            key: fixed.get(key, f"{prefixes[entry.role]}{'images.' * _is_camera(entry)}{key}")
+            key: _TASK
+            if key == keys.INSTRUCTION
+            else f"{IMAGES if _is_colour(entry) else _PREFIXES[entry.role]}{key}"
             for key, entry in entries.items()
         }
+
+    def is_beside(self, entry: Entry) -> bool:
+        """Return whether policies see other values than the observation's."""
+        return entry.role == "observation" and entry.dtype != "str" and not _is_colour(entry)
 
     def write(self, path: Path, episodes: Sequence[Arrays], card: Card) -> None:
         """Write by `LeRobotDataset`, frame by frame."""
         datasets = self.library("lerobot.datasets.lerobot_dataset")
-        entries = {entry.name: entry for entry in card.entries.values() if entry.dtype != "str"}
-        features = {name: _feature(entry) for name, entry in entries.items()}
+        view = _view(card)
+        observed = {
+            key: each.name
+            for key, each in card.entries.items()
+            if each.role == "observation" and each.dtype != "str"
+        }
+        stored = {
+            each.name: {"dtype": each.dtype, "shape": each.shape, "names": None}
+            for each in card.entries.values()
+            if each.dtype != "str" and not self.is_beside(each)
+        }
+        flag = {"dtype": "bool", "shape": (1,), "names": None}
         dataset = datasets.LeRobotDataset.create(
             repo_id=f"ba_torchrl/{path.name}",
             fps=card.resolved_env.video_fps,
-            features={**features, _DONE: {"dtype": "bool", "shape": (1,), "names": None}},
+            features={**stored, **view.features, _DONE: flag},
             root=path,
             robot_type=card.robot,
             use_videos=False,
             video_backend=_VIDEO_BACKEND,
         )
-        for arrays in episodes:
-            values = {
-                name: arrays[name].astype(features[name]["dtype"], copy=False)
-                if features[name]["dtype"] != "image"
-                else arrays[name]
-                for name in entries
-            }
-            values[_DONE] = arrays["next.terminated"] | arrays["next.truncated"]
-            for step in range(len(values[_DONE])):
-                frame: dict[str, Any] = {name: rows[step] for name, rows in values.items()}
-                frame[_TASK] = str(arrays[_TASK][step]) if _TASK in arrays else card.prompt
-                dataset.add_frame(frame)
-            dataset.save_episode()
-        dataset.finalize()
+        with _silent(self.library("datasets")):
+            for arrays in episodes:
+                values = {name: arrays[name] for name in stored}
+                values |= view.read({key: arrays[name] for key, name in observed.items()})
+                values[_DONE] = arrays["next.terminated"] | arrays["next.truncated"]
+                for step in range(len(values[_DONE])):
+                    frame: dict[str, Any] = {name: rows[step] for name, rows in values.items()}
+                    frame[_TASK] = str(arrays[_TASK][step]) if _TASK in arrays else card.prompt
+                    dataset.add_frame(frame)
+                dataset.save_episode()
+            dataset.finalize()
+        for folder in sorted(path.rglob("*"), reverse=True):
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+
+    def page(self, card: Card) -> str:
+        """Return what policies see, and the commands that train them."""
+        return _page(_view(card), card)
 
     def read(self, path: Path) -> list[Arrays]:
         """Read by `LeRobotDataset`: depth in metres, colours as uint8."""
@@ -184,18 +214,136 @@ def _stacked(frames: list[dict[str, Any]], cameras: set[str]) -> Arrays:
     return arrays
 
 
-def _is_camera(entry: Entry) -> bool:
-    """Whether LeRobot stores the entry as an image: a depth map, or colours."""
-    return entry.is_image and (entry.shape[0], entry.dtype) in ((1, "float32"), (3, "uint8"))
+def _is_colour(entry: Entry) -> bool:
+    """Whether the data set holds the entry itself, as a PNG picture."""
+    return entry.is_picture and entry.dtype == "uint8" and entry.shape[0] == 3
 
 
-def _feature(entry: Entry) -> dict[str, Any]:
-    """Return LeRobot's declaration of an entry."""
-    if _is_camera(entry):
-        feature = {"dtype": "image", "shape": entry.shape, "names": ["channels", "height", "width"]}
-        return feature | ({"info": {"is_depth_map": True}} if entry.dtype == "float32" else {})
-    dtype = "float32" if entry.name == _STATE else entry.dtype
-    return {"dtype": dtype, "shape": entry.shape, "names": None}
+def _view(card: Card) -> PolicyView:
+    """Return what policies see of the demonstrations."""
+    from ba_torchrl.envs.factory import make  # imports torch
+    from ba_torchrl.envs.lerobot import PolicyView
+
+    observed = [key for key, entry in card.entries.items() if entry.role == "observation"]
+    with closing(make(card.resolved_env)) as env:
+        return PolicyView(env, observed, card.cameras)
+
+
+@contextmanager
+def _silent(datasets: Any) -> Iterator[None]:
+    """Turn the progress bars of Hugging Face's library off."""
+    was_silent = datasets.are_progress_bars_disabled()
+    datasets.disable_progress_bars()
+    try:
+        yield
+    finally:
+        if not was_silent:
+            datasets.enable_progress_bars()
+
+
+_PAGE = """
+## What policies see
+
+| name | numbers, in this order | unit | frame |
+|---|---|---|---|
+{rows}
+
+Flags are 0 or 1. Depth and heights are pictures of three equal channels. `observations.npz` has
+every observation but colours without loss, with a row after the last action of each episode.
+
+## Training
+
+An episode has {length:.0f} steps on average. Both policies predict chunks of {horizon} actions and
+execute {executed} of them. `DATA` is this folder.
+
+```bash
+{act}
+
+{diffusion}
+```
+
+LeRobot's evaluation, and a test under BA-TorchRL's protocol:
+
+```bash
+{evaluate}
+```
+"""
+_SHORT = 12
+"""Mean length of an episode below which a chunk has 8 actions, not 16 (Chi et al., 2023)."""
+
+
+def _page(view: PolicyView, card: Card) -> str:
+    rows = []
+    for name, feature in view.features.items():
+        info = feature["info"]
+        numbers = ", ".join(feature["names"])
+        unit = info.get("unit", "0 to 255")
+        if "of_0" in info:
+            unit = f"{info['of_0']:g} m (0) to {info['of_255']:g} m (255)"
+        if feature["dtype"] == "image":
+            numbers = " x ".join(map(str, feature["shape"]))
+        rows.append(f"| `{name}` | {numbers} | {unit} | {info['frame']} |")
+    length = card.steps / card.episodes
+    horizon = 8 if length < _SHORT else 16
+    return _PAGE.format(
+        rows="\n".join(rows),
+        length=length,
+        horizon=horizon,
+        executed=horizon // 2,
+        act=_command("act", card, [f"chunk_size={horizon}", "optimizer_lr=1e-4"], horizon),
+        diffusion=_command(
+            "diffusion",
+            card,
+            [
+                f"horizon={horizon}",
+                "drop_n_last_frames=0",
+                "do_mask_loss_for_padding=true",
+                "down_dims=[128,256,512]",
+            ],
+            horizon,
+        ),
+        evaluate=_evaluation(card),
+    )
+
+
+def _command(policy: str, card: Card, settings: list[str], horizon: int) -> str:
+    """Return the command that trains a policy of LeRobot."""
+    settings = [
+        f"type={policy}",
+        *settings,
+        f"n_action_steps={horizon // 2}",
+        "pretrained_backbone_weights=null",
+        "push_to_hub=false",
+    ]
+    name = card.task.rpartition("/")[2]
+    words = [
+        f"--dataset.repo_id=ba_torchrl/{name} --dataset.root=$DATA",
+        " ".join(f"--policy.{setting}" for setting in settings),
+        f"--batch_size=32 --steps=5000 --output_dir=outputs/{policy}",
+    ]
+    return _lines("lerobot-train", words)
+
+
+def _evaluation(card: Card) -> str:
+    """Return the commands that evaluate a policy in the environment of the demonstrations."""
+    usual = json.loads(resolve_env(card.task, {}).config.model_dump_json())
+    parameters = {name: value for name, value in card.env.items() if usual[name] != value}
+    env = [f"--env.type=ba_torchrl --env.task={card.task}"]
+    if parameters:
+        env.append(f"--env.parameters={shlex.quote(json.dumps(parameters))}")
+    if card.cameras is not None:
+        env.append(f"--env.cameras={shlex.quote(json.dumps(card.cameras))}")
+    policy = "outputs/act/checkpoints/last/pretrained_model"
+    words = [
+        f"--policy.path={policy}",
+        *env,
+        "--eval.n_episodes=50 --eval.batch_size=5 --eval.use_async_envs=false",
+    ]
+    return _lines("lerobot-eval", words) + f"\nba-torchrl evaluate policy=lerobot:{policy}"
+
+
+def _lines(command: str, words: list[str]) -> str:
+    return " \\\n    ".join([command, *words])
 
 
 FORMATS.register("lerobot")(LeRobot())
