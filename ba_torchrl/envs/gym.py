@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import dataclasses
+import sys
 from collections.abc import Sequence
 from typing import Any, ClassVar
 
@@ -229,6 +230,8 @@ class ExpertPolicy:
     """
 
     def __init__(self, env: Any) -> None:
+        if policies := sys.modules.get("stable_baselines3.common.policies"):
+            policies.BasePolicy.register(ExpertPolicy)  # DAgger of imitation takes no other class
         self._env = env
         is_vector = isinstance(env, gymnasium.vector.VectorEnv)
         self.observation_space: spaces.Space = (

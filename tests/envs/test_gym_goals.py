@@ -166,12 +166,15 @@ def test_normalisers_take_flags(make):
 
 def test_the_expert_is_a_policy_of_stable_baselines(make):
     from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.policies import BasePolicy
     from stable_baselines3.common.vec_env import DummyVecEnv
 
     name = gym_id("close_loop/block_reaching", "State")
     vector = DummyVecEnv([lambda: make(name, expert=True)] * 2)
     for env in (vector, make(name, expert=True)):
-        assert evaluate_policy(ExpertPolicy(env), env, n_eval_episodes=3, warn=False)[0] == 1
+        expert = ExpertPolicy(env)
+        assert isinstance(expert, BasePolicy)  # which DAgger of imitation needs
+        assert evaluate_policy(expert, env, n_eval_episodes=3, warn=False)[0] == 1
 
 
 def test_the_expert_of_a_vector_acts_in_each_environment(make):
