@@ -1,7 +1,7 @@
 """CleanRL: its script for SAC, in three places adapted to Gymnasium 1.1, on the id of a state.
 
 git clone https://github.com/vwxyzjn/cleanrl; pip install tensorboard tyro
-python recipes/clients/cleanrl.py cleanrl/ --steps 6000
+python recipes/clients/cleanrl.py cleanrl/ --steps 4500
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from pathlib import Path
 
 parser = argparse.ArgumentParser()
 parser.add_argument("folder", type=Path, help="of CleanRL's repository")
-parser.add_argument("--steps", type=int, default=6000)
+parser.add_argument("--steps", type=int, default=4500)
 parser.add_argument("--log", type=Path, default=Path("cleanrl.jsonl"), help="new file")
 options = parser.parse_args()
 

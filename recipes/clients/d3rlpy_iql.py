@@ -3,7 +3,7 @@
 pip install d3rlpy==2.8.1
 ba-torchrl collect task=close_loop/block_reaching episodes=50 env.obs_type=vec path=demos/reaching
 ba-torchrl convert demos/reaching format=hdf5 path=exports/reaching.hdf5
-python recipes/clients/d3rlpy_iql.py exports/reaching.hdf5 --steps 2000
+python recipes/clients/d3rlpy_iql.py exports/reaching.hdf5 --steps 1000
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from played import played
 
 parser = argparse.ArgumentParser()
 parser.add_argument("file", help="of ba-torchrl convert format=hdf5")
-parser.add_argument("--steps", type=int, default=2000)
+parser.add_argument("--steps", type=int, default=1000)
 options = parser.parse_args()
 
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"

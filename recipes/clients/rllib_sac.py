@@ -1,7 +1,7 @@
 """RLlib: SAC learns to reach a block from its state.
 
 pip install "ray[rllib]==2.60.0"
-python recipes/clients/rllib_sac.py --steps 4000
+python recipes/clients/rllib_sac.py --steps 3000
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from ray.rllib.core.columns import Columns
 from ray.tune.registry import register_env
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--steps", type=int, default=4000)
+parser.add_argument("--steps", type=int, default=3000)
 options = parser.parse_args()
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
 VALUES = {"action_sequence": "pxyz", "random_orientation": False}  # without yaw
