@@ -135,6 +135,7 @@ class ImproviseHouseBuilding3(StructureTask):
     num_objects_range = (4, 4)
     start_gap_m = START_GAP_M
     least_pick_blocks = 0.0
+    equal_moves = 16
 
     def blueprint(self) -> Blueprint:
         """Return two shapes that support the cuboid, which supports the roof."""

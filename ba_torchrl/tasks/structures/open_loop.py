@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from typing import ClassVar
@@ -75,7 +76,12 @@ class StructureTask(StructureGoal, OpenLoopTask):
 
     def expert_command(self) -> PickPlaceCommand:
         """Return the pick or place of the planner's next move."""
-        return PickPlaceExpert(self.grasps()).command()
+        return next(PickPlaceExpert(self.grasps()).commands())
+
+    def expert_moves(self) -> list[PickPlaceCommand]:
+        """Return that command, then picks of pieces alike, or places in slots alike and at other
+        yaws, that are as good."""
+        return list(itertools.islice(PickPlaceExpert(self.grasps()).commands(), self.equal_moves))
 
     def pick_height_m(self, top_m: float, xy: tuple[float, float]) -> float:
         """Return the height of the tool for a pick without z, at least `least_pick_blocks`."""

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from operator import itemgetter
 
 from ba_torchrl.core.actions import PickPlaceCommand, wrap_angle
 from ba_torchrl.sim.bodies import Body
@@ -19,11 +21,13 @@ from ba_torchrl.tasks.manipulation.top_down_grasps import is_reachable
 from ba_torchrl.tasks.structures.free_space import PlacementArea
 from ba_torchrl.tasks.structures.moves import Move
 from ba_torchrl.tasks.structures.piece_grasps import SUFFICIENT_CLEARANCE_M, PickPlaceGrasps, Tilted
-from ba_torchrl.tasks.structures.planner import next_move
+from ba_torchrl.tasks.structures.planner import next_moves
 from ba_torchrl.tasks.structures.tilts import release_pose, resting_frame
 
 RELEASE_YAWS = 8
 """Yaws per half turn that are compared for a place with any yaw."""
+EQUAL_CLEARANCE_M = 2e-3
+"""Clearances of places whose difference is at most this are equally good."""
 BORDER_BLOCKS = 1.5
 """Distance of placements from the border of their area, in blocks."""
 
@@ -38,14 +42,24 @@ class PickPlaceExpert:
         self.terrain = grasps.terrain
         self.limits = grasps.limits
 
-    def command(self) -> PickPlaceCommand:
-        """Return the pick or place of the planner's next move; a no-op if the structure stands."""
+    def commands(self) -> Iterator[PickPlaceCommand]:
+        """Yield the pick or place of the planner's next move, a no-op if the structure stands; then
+        picks of pieces alike, or places in slots alike and at other yaws, that are as good."""
         held = self.robot.held_body()
-        move = next_move(self.structure.assigner(held), self.placement_area(), self.grasps)
-        if move is None:
-            return no_op(self.terrain.workspace, held is not None)
-        if move.body is held:
-            return self._place(move)
+        moves = next_moves(self.structure.assigner(held), self.placement_area(), self.grasps)
+        if not moves:
+            yield no_op(self.terrain.workspace, held is not None)
+        elif moves[0].body is held:
+            for move in moves:
+                yield from self._places(move)
+        else:
+            yield self._first_pick(moves[0])
+            if self.grasps.is_free(moves[0].body):
+                free = (move.body for move in moves[1:] if self.grasps.is_free(move.body))
+                yield from map(self.pick, free)
+
+    def _first_pick(self, move: Move) -> PickPlaceCommand:
+        """Return the pick of a move's piece, or of one that is in its way."""
         body = self._piece_to_pick(move.body)
         if self.limits.turn_rad and not self.grasps.is_free(body):
             grasp = self.grasps.attempt(body)
@@ -90,14 +104,17 @@ class PickPlaceExpert:
             line_yaw_rad=None if self.limits.turn_rad else math.pi / 2,
         )
 
-    def _place(self, move: Move) -> PickPlaceCommand:
-        """Return the place that brings the held body to the pose of a move.
+    def _places(self, move: Move) -> Iterator[PickPlaceCommand]:
+        """Yield the places that bring the held body to the pose of a move.
 
-        Of several yaws it is the first at which the opening fingers have the largest clearance.
+        Of several yaws they are the first at which the opening fingers have the largest clearance,
+        then those at which they have as much.
         """
         tool, held = self.robot.tool_frame(), move.body.pose
         if self.limits.can_tilt:
-            return place_command(tool, held, self._best_release(move))
+            for pose in self._best_releases(move):
+                yield place_command(tool, held, pose)
+            return
         if not self.limits.turn_rad:
             yaws = [0.0]
         elif move.yaw_rad is None:
@@ -111,8 +128,13 @@ class PickPlaceExpert:
             found_m = self.grasps.clearance_m(move.body, yaw_rad, move.position)
             return min(found_m, SUFFICIENT_CLEARANCE_M)
 
-        yaw = yaws[0] if len(yaws) == 1 else max(yaws, key=clearance_m)
-        return place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
+        if len(yaws) > 1:
+            clearances_m = {yaw: clearance_m(yaw) for yaw in yaws}
+            best = max(yaws, key=clearances_m.get)
+            least_m = clearances_m[best] - EQUAL_CLEARANCE_M
+            yaws = [best, *(y for y in yaws if y != best and clearances_m[y] >= least_m)]
+        for yaw in yaws:
+            yield place_command(tool, held, held.moved_to(move.position, yaw - tool.yaw_rad))
 
     def _release_poses(self, move: Move) -> list[Pose]:
         """Return the poses at which the held body can be released parallel to its support."""
@@ -127,8 +149,9 @@ class PickPlaceExpert:
         origin = Pose(move.position, move.surface)
         return [release_pose(move.piece, move.body, origin, yaw) for yaw in yaws]
 
-    def _best_release(self, move: Move) -> Pose:
-        """Return the pose of the held body at its release, the best of those within reach.
+    def _best_releases(self, move: Move) -> Iterator[Pose]:
+        """Yield the pose of the held body at its release that is the best of those within reach,
+        then those that are as good.
 
         Poses that the tool reaches without a half turn come first: the held body may be tilted or
         off the centre of the fingers.
@@ -139,14 +162,19 @@ class PickPlaceExpert:
             is_exact = not swaps_fingers(carrying_pose(tool, held, pose))
             return is_exact, self._release_clearance_m(move, pose)
 
-        ranked = sorted(self._release_poses(move), key=quality, reverse=True)
+        ranked = [(quality(pose), pose) for pose in self._release_poses(move)]
+        ranked.sort(key=itemgetter(0), reverse=True)
         supports, clearance_m = self.terrain.support_ids, PickPlaceLimits().pre_place_height_m
-        reachable = (
-            pose
-            for pose in ranked
-            if is_reachable(self.robot, supports, carrying_pose(tool, held, pose), clearance_m)
-        )
-        return next(reachable, ranked[0])
+        least = None
+        for (is_exact, found_m), pose in ranked:
+            if least is not None and (is_exact, found_m) < least:
+                return
+            target = carrying_pose(tool, held, pose)
+            if is_reachable(self.robot, supports, target, clearance_m):
+                least = least or (is_exact, found_m - EQUAL_CLEARANCE_M)
+                yield pose
+        if least is None:
+            yield ranked[0][1]
 
     def _release_clearance_m(self, move: Move, target: Pose) -> float:
         """Return the clearance of the opening fingers, less what they lack above the ground."""

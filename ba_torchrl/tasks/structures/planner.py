@@ -30,7 +30,19 @@ def next_move(assigner: SlotAssigner, area: PlacementArea, grasps: Grasps) -> Mo
     Args:
         area: where pieces may be placed on the ground.
     """
-    return _Planner(assigner, area, grasps).next_move()
+    return next(iter(next_moves(assigner, area, grasps)), None)
+
+
+def next_moves(assigner: SlotAssigner, area: PlacementArea, grasps: Grasps) -> list[Move]:
+    """Return the next move and those that are as good, of one for each piece of the same kind, or
+    of the held piece for each slot; none if the structure stands.
+
+    They lead to the structure in as few moves as the first, with as much room, and may be farther.
+
+    Args:
+        area: where pieces may be placed on the ground.
+    """
+    return _Planner(assigner, area, grasps).next_moves()
 
 
 class _Option(NamedTuple):
@@ -57,12 +69,14 @@ class _Planner:
         self.repair = Repair(assigner, grasps)
         self.pick_cost_m = cache(grasps.pick_cost_m)
 
-    def next_move(self) -> Move | None:
-        """Return the next move; None if the structure stands."""
+    def next_moves(self) -> list[Move]:
+        """Return the next move and its equals; none if the structure stands."""
         assignments, filled = self.assigner.largest_assignments()
         if filled == len(self.slots):
-            return self._last_move(assignments)
+            last = self._last_move(assignments)
+            return [] if last is None else [last]
         best: _Option | None = None
+        options: list[_Option] = []
         for assignment in assignments:
             choices = [*self._choices(assignment), *self.repair.grasp_removals(assignment)]
             # cheap lower bounds first, so that most of the others are skipped
@@ -71,10 +85,37 @@ class _Planner:
                 if choice.body is not self.held and self.repair.is_blocked(choice.body):
                     moves += BLOCKED_MOVES
                 if best is None or moves <= best.moves:
-                    option = self._option(choice, moves, assignment)
+                    options.append(option := self._option(choice, moves, assignment))
                     best = option if best is None or option[:2] < best[:2] else best
         assert best is not None  # the lowest empty slot always has a choice
-        return best.move or self._to_ground(best.body)
+        if best.move is None:
+            return [self._to_ground(best.body)]
+        equal = [best]
+        for option in sorted(options, key=lambda option: option.distance_m):
+            if (
+                option is not best
+                and self._is_equal(option, best)
+                and not any(self._is_same(option, other) for other in equal)
+            ):
+                equal.append(option)
+        return [option.move for option in equal]
+
+    def _is_equal(self, option: _Option, best: _Option) -> bool:
+        """Whether an option is as good as the best one but for the distance."""
+        if option.moves != best.moves or option.move is None:
+            return False
+        if self.pieces[option.body].kind != self.pieces[best.body].kind:
+            return False
+        has_room = option.move.deficit_m <= best.move.deficit_m
+        if self.held is not None:
+            return has_room
+        return has_room and self.pick_cost_m(option.body) <= self.pick_cost_m(best.body)
+
+    def _is_same(self, option: _Option, other: _Option) -> bool:
+        """Whether two options pick the same piece, or place the held one at the same position."""
+        if self.held is None:
+            return option.body is other.body
+        return option.move.position == other.move.position
 
     def _last_move(self, assignments: Sequence[Assignment]) -> Move | None:
         """Return the move of a piece that is left over when all slots are filled."""

@@ -6,6 +6,7 @@ import pytest
 
 from ba_torchrl.tasks.structures.pick_place_expert import PickPlaceExpert
 from ba_torchrl.tasks.structures.planner import next_move
+from tests.tasks.episodes import follow
 
 B = 0.03
 X, Y = 0.45, 0.0
@@ -124,6 +125,19 @@ def test_every_episode_draws_its_shapes(make_started, name):
 
 
 # -- experts -----------------------------------------------------------------------------------
+
+
+def test_either_of_the_two_shapes_can_be_picked_first(make_env):
+    env = make_env("open_loop/improvise_house_building_3")
+    state = env.reset()
+    moves = state["expert_moves"].unique(dim=0)
+    shapes = [body.position[:2] for body in env.scene.task.objects if "object" in body.name]
+    nearest = [min(math.dist(move, xy) for move in moves[:, 1:3].tolist()) for xy in shapes]
+    assert len(moves) == len(shapes) == 2
+    assert max(nearest) < B / 2
+    other = moves[(moves != state["expert_action"]).any(dim=1)]
+    (after,) = follow(env, state, 1, action=other[0])
+    assert after["holding"]
 
 
 def test_the_structure_starts_at_a_site_where_other_picks_have_clearance(make_started):

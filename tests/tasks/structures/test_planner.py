@@ -8,6 +8,7 @@ import pytest
 from ba_torchrl.tasks.structures.blueprint import tower
 from ba_torchrl.tasks.structures.moves import Grasps
 from ba_torchrl.tasks.structures.pieces import CUBE, TRIANGLE
+from ba_torchrl.tasks.structures.planner import next_moves
 from tests.tasks.structures.scenes import AREA, BRIDGE, SPAN, THREE_STOREYS, TWO_STOREYS, B
 
 
@@ -49,6 +50,28 @@ def test_a_move_has_body_supports_position_and_yaw(scene):
     quarter_turns = (move.yaw_rad - 0.3) / (math.pi / 2)
     assert quarter_turns == pytest.approx(round(quarter_turns), abs=1e-3)
     assert move.yaw_period_rad == pytest.approx(math.pi / 2)
+
+
+def test_pieces_alike_and_slots_alike_are_equally_good(scene):
+    """Nothing is placed, three cubes lie around: the nearest pair comes first."""
+    s = scene(THREE_STOREYS)
+    s.scatter(np.random.default_rng(1))
+
+    def moves(held=None):
+        return next_moves(s.assigner(held), AREA, Grasps())
+
+    found = moves()
+    assert found[0] == s.next_move()
+    assert {move.body for move in found} == set(s.cubes)
+    while (move := s.next_move()) is not None and move.piece.kind != "cuboid":
+        move.body.place(move.position)
+        s.settle()
+    assert [each.body for each in moves()] == s.bodies["cuboid"]  # no other piece is alike
+    move.body.place(move.position, move.yaw_rad)
+    s.settle()
+    free = [cube for cube in s.cubes if cube not in s.assigner(None).placed()]
+    assert {move.body for move in moves()} == set(free)
+    assert [move.body for move in moves(free[0])] == free[:1]  # what is held is placed
 
 
 def test_the_next_cube_balances_a_leaning_tower(scene):
