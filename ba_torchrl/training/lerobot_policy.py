@@ -201,7 +201,7 @@ def load_lerobot(folder: str | Path, device: str = "cpu") -> LeRobotPolicy:
     places = [root / place for place in _PLACES]
     found = next((place for place in places if (place / _CONFIG).is_file()), None)
     if found is None:
-        raise ConfigError(f"no checkpoint of LeRobot at {root}: it has {_CONFIG} and {_WEIGHTS}")
+        raise ConfigError(f"no checkpoint of LeRobot at {root}: one has {_CONFIG} and {_WEIGHTS}")
     trained = _Training(found)
     try:
         factory = importlib.import_module("lerobot.policies.factory")
