@@ -19,7 +19,7 @@ import ba_torchrl
 from ba_torchrl.cli import EXIT_CODE, types
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.cli.types import check_writable_file
-from ba_torchrl.core.config import StrictModel, expanded, parse
+from ba_torchrl.core.config import StrictModel, descriptions, expanded, parse
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import atomic_output
 from tests.recipes import load_recipe, recipe
@@ -182,8 +182,9 @@ def test_every_path_among_the_settings_has_the_type_of_paths():
     ours = [model for model in models(StrictModel) if model.__module__.startswith("ba_torchrl.")]
     found, others = set(), set()
     for model in {*ours, *recipes}:
+        texts = descriptions(model)
         for name, field in model.model_fields.items():
-            words = f"{name} {field.description}".lower()
+            words = f"{name} {texts.get(name)}".lower()
             speaks = re.search(r"\b(file|folder|path)s?\b|path|_dir|root|folder|mapping", words)
             if takes_path(field):
                 found.add(name)
