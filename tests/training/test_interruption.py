@@ -184,10 +184,12 @@ def test_a_run_that_was_killed_repeatedly_ends_with_the_same_bits(tmp_path, undi
     assert_same(run(config_for(tmp_path, resume=True)), undisturbed)
 
 
-@pytest.mark.parametrize("name", ["dagger", "flow_dagger"])
-def test_a_run_that_was_killed_counts_each_label_once(tmp_path, name):
-    """With chunks, some of which are executed in part when the run is killed."""
-    options = {"algorithm": {"name": name, "batch_size": 4}, "eval_every": 50}
+@pytest.mark.parametrize(
+    "algorithm", [{"name": "dagger"}, {"name": "flow_dagger", "horizon": 3, "executed": 3}]
+)
+def test_a_run_that_was_killed_counts_each_label_once(tmp_path, algorithm):
+    """With chunks, the run is killed while some are executed in part."""
+    options = {"algorithm": {"batch_size": 4, **algorithm}, "eval_every": 50}
     whole = run(config_for(tmp_path / "whole", **options))
     assert whole[1]["expert_labels"] == whole[1]["env_steps"] > 0
     assert (whole[1]["demonstrations"], whole[1]["demonstration_steps"] >= 2) == (2, True)

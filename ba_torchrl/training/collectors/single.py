@@ -80,6 +80,8 @@ class SingleCollection(Collection):
 class _Continuing(TensorDictModuleBase):
     """A policy, which gets in its first call what it carried to this step before.
 
+    TorchRL's collector calls it once more at the start, to see what it writes.
+
     Args:
         policy: acts on a root TensorDict [num_envs].
         carried: entries [num_envs]; None for none.
@@ -91,7 +93,6 @@ class _Continuing(TensorDictModuleBase):
         self.in_keys, self.out_keys = list(policy.in_keys), list(policy.out_keys)
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        if self._carried is not None:
+        if self._carried is not None and keys.CARRIED not in tensordict:
             tensordict.set(keys.CARRIED, self._carried.to(tensordict.device))
-            self._carried = None
         return self.policy(tensordict)
