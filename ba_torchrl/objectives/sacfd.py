@@ -260,7 +260,7 @@ class SACfDLoss(TransitionLoss):
             self.target_entropy = -float(sample.shape[-1])
         # Detached features and heads: the gradient reaches the actor's parameters only, through the
         # action.
-        q_pi = self._values(features.detach(), sample, self.qvalue_network_params.data)
+        q_pi = self._values(features.detach(), sample, self.qvalue_network_params.detach())
         policy_term = self._over_views(self.alpha * log_prob - self._policy_value(q_pi))
         is_demonstration = self._demonstration_flag(tensordict)
         error = self._demonstration_error(tensordict, sample)

@@ -5,6 +5,7 @@ import dataclasses
 
 import pytest
 import torch
+from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor, QValueActor, TanhNormal
@@ -266,6 +267,22 @@ def test_each_parameter_has_a_gradient_and_no_target_has(name):
     targets = [key for key, _ in loss.named_buffers() if is_of_target(key)]
     assert bool(targets) == (name in TRAINED_BY_TARGETS)
     assert not any(buffer.requires_grad for buffer in loss.buffers())
+
+
+@each_of_ours
+@pytest.mark.filterwarnings("ignore:There is a performance drop")
+def test_an_ensemble_is_computed_by_one_vmap(name):
+    loss, data = make(name), data_of(name)
+    params = [TensorDict.from_module(each).data.clone() for each in (make(name, seed=1), loss)]
+
+    def total(params):
+        with params.to_module(loss):
+            return sum(terms(loss(data.clone())).values())
+
+    torch.manual_seed(7)
+    found = torch.vmap(total, randomness="same")(torch.stack(params))
+    expected = [sum(terms(called(make(name, seed), data)).values()) for seed in (1, 0)]
+    torch.testing.assert_close(found, torch.stack(expected))
 
 
 @every_loss
