@@ -146,7 +146,7 @@ def descriptions(model: type[BaseModel]) -> dict[str, str]:
 
 @cache
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
-    """Return the docstrings below the fields of a class, without those of its bases."""
+    """Return the docstrings below the fields of a class, not of its bases."""
     try:
         body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0].body
     except (OSError, TypeError):  # of a class without a file

@@ -50,7 +50,7 @@ logger = logging.getLogger(__name__)
 
 _COUNTED = {*keys.STEP_FLAGS, keys.STEP_COUNT}
 """Entries of a state that follow from the results of the steps before it."""
-_OWN = {keys.EXPERT_MOVES}
+_OWN = {*keys.OF_EXPERT} - {keys.EXPERT_ACTION}
 """Entries that no other library has."""
 _MOST_INSTRUCTIONS = 20
 

@@ -194,7 +194,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
         """Return the expert's action."""
 
     def _expert_specs(self, action: Bounded) -> dict[str, Bounded]:
-        """Return the specifications of the entries of `_expert_entries`, from that of actions."""
+        """Return the specifications of `_expert_entries`, from the specification of actions."""
         return {keys.EXPERT_ACTION: action.clone()}
 
     def _expert_entries(self, scene: Scene) -> dict[str, np.ndarray]:

@@ -20,9 +20,9 @@ _GOALS = ("achieved_goal", "desired_goal")
 class GoalEnv(GymEnv):
     """A `GymEnv` with a state in ``observation`` beside ``achieved_goal`` and ``desired_goal``.
 
-    The state is that of `StateEnv` without the pose of the goal. Rewards and ends are those of the
-    task; the three ``compute_...`` methods return them for other goals. A simulator fault and an
-    invalid scene achieve nothing: both goals are then those of the step before.
+    The state is as in `StateEnv`, without the pose of the goal. Rewards and ends are the task's;
+    the three ``compute_...`` methods return them for other goals. A simulator fault and an invalid
+    scene achieve nothing: both goals then stay as they were in the step before.
 
     Args:
         task: one of `ba_torchrl.tasks.goals.GOALS`.

@@ -246,7 +246,7 @@ class ExpertPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """Return the expert's action, [A], or those of a vector, [environments, A]; and ``state``.
+        """Return the expert's action [A], of a vector [environments, A]; and ``state``.
 
         Args:
             observation: one, or a batch with one for each environment; its values are not read.

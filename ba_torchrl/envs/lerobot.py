@@ -36,7 +36,7 @@ class PolicyView:
     """The state, the poses and the pictures that stock policies of LeRobot read.
 
     Booleans are 0 or 1, depth and heights are pictures of three equal channels, 0 to 255 over the
-    range of the image. By default, pictures are all images of one size, that of the first of
+    range of the image. By default, pictures are all images of one size, the size of the first of
     ``rgb``, ``wrist_rgb`` and the others: LeRobot's Diffusion Policy takes no other.
 
     Args:
@@ -132,7 +132,7 @@ class PolicyView:
         """Return an observation as policies see it.
 
         Args:
-            observation: arrays by key, with any axes before those of one step.
+            observation: arrays by key, with any axes before the axes of one step.
 
         Returns:
             Vectors as float32 and pictures [..., 3, H, W] as uint8, by LeRobot's names.

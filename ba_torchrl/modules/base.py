@@ -86,7 +86,7 @@ class Frames(NamedTuple):
 
     @classmethod
     def without_symmetry(cls, spec: ActorCriticSpec) -> Self:
-        """Return those of features that end in the specification's vectors, unchanged."""
+        """Return frames for features that do not move and end in the specification's vectors."""
         sizes = (spec.action_size, spec.vector_size)
         return cls(*(torch.eye(size, dtype=torch.float32, device="cpu")[None] for size in sizes))
 

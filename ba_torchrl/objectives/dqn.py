@@ -36,7 +36,7 @@ class LevelValues(Protocol):
         ...
 
     def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values [B, N] of each level, and which choices are those of one of K actions,
+        """Return the values [B, N] of each level, and which choices belong to one of K actions,
         bool [B, N]; only losses of sets of actions ask.
 
         The values of a level, and the actions that count there, are those after the choice of the

@@ -157,7 +157,7 @@ class LevelCrossEntropyLoss(ImitationLoss):
             level, see `SingleLevelValues`.
         reduction: "mean", "sum", or "none" for one loss per sample; "mean" if None.
         of_sets: whether the entry ``action`` has K actions of each sample, some of them perhaps
-            repeated, in a dimension before that of an action's components.
+            repeated, in a dimension before the dimension of an action's components.
 
     Examples:
         >>> import torch

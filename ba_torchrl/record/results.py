@@ -213,7 +213,7 @@ class RunResult(StrictModel):
     def _check_task(cls, config: dict[str, Any], info: ValidationInfo) -> dict[str, Any]:
         task = info.data.get("task")
         if config.get("task", task) != task:
-            raise ValueError(f"its task, {config['task']!r}, is not that of the result")
+            raise ValueError(f"its task, {config['task']!r}, is not the result's")
         return config
 
     @field_validator("files")
@@ -286,7 +286,7 @@ def shipped_file(task: str) -> Path:
 
 
 def shipped_policies() -> list[str]:
-    """Return the tasks of which the package ships a policy."""
+    """Return the tasks for which the package ships a policy."""
     files = POLICIES.rglob(f"*{POLICY_SUFFIX}")
     return sorted(file.relative_to(POLICIES).with_suffix("").as_posix() for file in files)
 

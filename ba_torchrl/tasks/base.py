@@ -106,6 +106,9 @@ class Task(ABC):
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False
     """Whether the objects fit the tray of `close_loop_tray`."""
+    equal_moves: ClassVar[int] = 0
+    """Open loop: largest number of commands of `expert_moves`; 0 if the expert gives its own
+    alone."""
 
     Parameters: ClassVar[type[TaskParameters]] = TaskParameters
     """Model of the task's own parameters; its fields are keywords of `ba_torchrl.make`."""
@@ -311,11 +314,9 @@ class OpenLoopTask(Task):
     scale_limits = (0.55, 1.1)
     finger_opening: ClassVar[float] = 1.0
     """Opening of the gripper before a pick, 0 to 1."""
-    equal_moves: ClassVar[int] = 0
-    """Largest number of commands of `expert_moves`; 0 if the expert gives its own alone."""
 
     def expert_moves(self) -> Sequence[PickPlaceCommand]:
-        """Return commands as good as that of `expert_command`, which is the first of them.
+        """Return the command of `expert_command` first, then commands that are as good.
 
         With `equal_moves`, a policy is trained to choose any of them.
         """

@@ -133,7 +133,7 @@ def _labels(env: BulletArmEnv) -> list[np.ndarray]:
     """Return the expert's action in the present scene, and the moves that it holds for equal."""
     scene: Scene = env.scene
     with scene.world.fixed_poses():
-        if getattr(scene.task, "equal_moves", 0):
+        if scene.task.equal_moves:
             moves = scene.task.expert_moves()
         else:
             moves = [scene.task.expert_command()]

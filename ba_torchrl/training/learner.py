@@ -45,7 +45,7 @@ def problem_of(config: ExperimentConfig) -> Problem:
     task_class = config.env.task_class
     return Problem(
         control=task_class.control,
-        equal_moves=getattr(task_class, "equal_moves", 0),
+        equal_moves=task_class.equal_moves,
         images=env.images,
         vectors=env.vectors,
         center_m=config.env.workspace.center,

@@ -1,7 +1,7 @@
-"""Stable-Baselines3 and sb3-contrib: TQC learns to reach a block from its state.
+"""Stable-Baselines3 and sb3-contrib: SAC or TQC learns to reach a block from its state.
 
 pip install stable-baselines3==2.9.2 sb3-contrib==2.9.2
-python recipes/clients/sb3.py --steps 5000
+python recipes/clients/sb3.py sac
 """
 
 from __future__ import annotations

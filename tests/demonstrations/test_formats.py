@@ -923,6 +923,16 @@ def test_an_episode_whose_file_marks_no_end_is_truncated(names, tmp_path):
     assert first["next", "done"].flatten().tolist() == [False, False, True]
 
 
+def test_what_the_expert_would_do_next_is_left_out(episodes, tmp_path):
+    shapes = {"expert_moves": (4, 5), "expert_chunk": (3, 5), "expert_chunk_mask": (3,)}
+    more = [
+        episode.clone().update({k: torch.zeros(len(episode), *v) for k, v in shapes.items()})
+        for episode in episodes
+    ]
+    path = exported(tmp_path, more, "hdf5")
+    assert_equal(load_demonstrations(path, task=TASK, env=ENV), episodes)
+
+
 def test_files_beside_an_export_are_left_alone(episodes, tmp_path):
     others = [tmp_path / "picking.json", tmp_path / "picking.md"]
     for file in others:

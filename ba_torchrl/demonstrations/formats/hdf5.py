@@ -31,7 +31,7 @@ _OBS, _NEXT_OBS = "obs/", "next_obs/"
 _LANGUAGE = "ep_meta/lang"
 """robomimic's name of the instruction, in an attribute of the episode."""
 _VALID_EVERY = 10
-"""One of so many episodes is for validation, as in robomimic's own split."""
+"""Every tenth episode is for validation: as many as in robomimic's own split."""
 
 
 class Robomimic(Format):

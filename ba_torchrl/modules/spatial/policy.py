@@ -219,7 +219,7 @@ class SpatialValues(nn.Module):
         return found
 
     def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values of every level, and which choices are those of one of several actions.
+        """Return the values of every level, and which choices belong to one of several actions.
 
         The values of a level, and the actions that count there, are those after the choice of the
         greatest value among the actions at each level before.

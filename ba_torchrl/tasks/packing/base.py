@@ -159,7 +159,7 @@ class PackingTask(OpenLoopTask):
         return self.equal_grasps(body)[0]
 
     def equal_grasps(self, body: Body) -> list[TopDownGrasp]:
-        """Return the grasp of an object, then those of its other sides that are as good."""
+        """Return the grasp of an object, then grasps of its other sides that are as good."""
         height = self.pick_height_m(vertical_extent(body)[1], body.position[:2])
         gripper = self.robot.gripper
         obstacles = self.obstacles(body, height + self.tips_m)

@@ -59,7 +59,7 @@ class PickPlaceExpert:
                 yield from map(self.pick, free)
 
     def _first_pick(self, move: Move) -> PickPlaceCommand:
-        """Return the pick of a move's piece, or of one that is in its way."""
+        """Return the pick of a move's piece, or of a piece that is in its way."""
         body = self._piece_to_pick(move.body)
         if self.limits.turn_rad and not self.grasps.is_free(body):
             grasp = self.grasps.attempt(body)
