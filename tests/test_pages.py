@@ -31,7 +31,6 @@ SHORTER = {
     "range(5000)": "range(5)",
     "range(10_000, 10_050)": "range(1)",
     "policy, 100, seed=0)": "policy, 5, seed=0)",
-    "buffer_size=10_000": "buffer_size=200",
     '"close_loop/block_picking", 5, seed=0)': '"close_loop/block_picking", 1, start_method="fork")',
     '"close_loop/block_picking", 5,': '"close_loop/block_picking", 1,',
     '"mine/stack_on_plateau", 4)': '"mine/stack_on_plateau", 1, start_method="fork")',
