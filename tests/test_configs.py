@@ -98,6 +98,23 @@ def test_a_method_is_an_algorithm_a_replay_and_a_rotation(name):
 
 
 @pytest.mark.parametrize(
+    ("overrides", "label"),
+    [
+        (["algorithm={name: rlpd}", "algorithm.replay.name=symmetric"], "rlpd_symmetric_so2 equi"),
+        (["algorithm={name: iql, replay: {name: uniform}}"], "iql equi"),  # has no rotation
+        (["algorithm={name: sac}"], "sacfd_per_so2 equi"),  # as it is
+        (["algorithm={gamma: 0.9}", "network={name: cnn}"], "sacfd_per_so2 cnn"),
+        (["algorithm=rad", "algorithm.imitation.name=none"], "rad_imitation_none equi"),
+        (["algorithm.replay.name=uniform", "algorithm.rotation.name=stored"], "sacfd_stored equi"),
+    ],
+)
+def test_the_label_names_the_parts_that_replace_those_of_presets(overrides, label):
+    config = experiment("train", *overrides)
+    assert config.label == label
+    assert f"-{label.replace(' ', '_')}-seed0" in config.run_dir
+
+
+@pytest.mark.parametrize(
     ("name", "message"),
     [
         ("bc_per", "replay.name: Input should be 'uniform'"),

@@ -31,6 +31,8 @@ from ba_torchrl.record.results import flat
 LOG_FORMAT = "[%(asctime)s][%(name)s][%(levelname)s] - %(message)s"
 _OTHER_BASE = re.compile(r"[-+]?(0[0-7_]*[1-7][0-7_]*|\d[\d_]*(:[0-5]?\d)+(\.[\d_]*)?)")
 """Numbers that YAML 1.1 reads with base 8 or 60, such as 064 and 6:40."""
+_NAME = re.compile(r"[^.\[\]\s]+(\.[^.\[\]\s]+|\[[^\[\]\s]+\])*")
+"""Name of a setting: fields of fields, such as env.obs_size or env[obs_size]."""
 
 
 @dataclass(frozen=True)
@@ -177,14 +179,23 @@ class Command:
         """Whether a word chooses a preset, or is another one of Hydra's."""
         if self.config is None:
             return False
-        group = word.lstrip("+").partition("=")[0].partition("@")[0]
+        name, _, value = word.lstrip("+").partition("=")
+        group = name.partition("@")[0]
         folders = [config_dir(), *([] if further is None else [Path(further)])]
-        is_group = bool(group) and any((folder / group).is_dir() for folder in folders)
-        return is_group or group.startswith(("~", "hydra.", "hydra/"))
+        is_group = group.strip("./") == group != "" and any(
+            (folder / group).is_dir() for folder in folders
+        )
+        is_choice = is_group and not value.startswith("{")  # which are fields of the group's choice
+        return is_choice or group.startswith(("~", "hydra.", "hydra/"))
 
     def _set(self, given: DictConfig, word: str) -> None:
         """Set the field of a word such as ``env.obs_size=64``."""
         name, _, text = word.lstrip("+").partition("=")
+        if not _NAME.fullmatch(name):
+            raise ConfigError(f"cannot read {word!r}: a setting is written as in env.obs_size=64")
+        field = re.split(r"[.\[]", name)[0]
+        if field != name and field in self.fields and takes_list(self.fields[field]):
+            raise ConfigError(f"{name}: {field} is a list, which is set as a whole: {field}=[...]")
         try:
             OmegaConf.update(given, name, self._value(name, text), force_add=True)
         except (YAMLError, OmegaConfBaseException, RecursionError) as error:
@@ -252,5 +263,6 @@ class Command:
         if name not in known:
             raise UnknownNameError("configuration", name, known)
         further = None if arguments.config_dir is None else Path(arguments.config_dir)
-        with presets.composed(config_dir(), name, arguments.presets, further) as settings:
+        read = presets.composed(config_dir(), name, arguments.presets, further, arguments.given)
+        with read as settings:
             yield OmegaConf.merge(defaults, settings, arguments.given)

@@ -180,7 +180,7 @@ def explain(
         if _is_inner(item):
             continue
         names, owner, parts = _place(model, item["loc"])
-        field, kind = ".".join(names) or "configuration", item["type"]
+        field, kind = ".".join(names) if names else "configuration", item["type"]
         if kind == "extra_forbidden":
             is_known, hint = owner is model and known is not None, ""
             if item["loc"][-2:-1] and item["loc"][-2] in parts:  # the name of a choice

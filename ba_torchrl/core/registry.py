@@ -128,7 +128,7 @@ class Registry(Generic[T]):
 
     def __contains__(self, name: object) -> bool:
         self._scan()
-        return name in self._entries
+        return isinstance(name, str) and name in self._entries  # a list is not hashable
 
     def __iter__(self) -> Iterator[str]:
         self._scan()

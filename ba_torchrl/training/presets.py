@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, MutableMapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,9 +13,10 @@ from hydra.core.config_store import ConfigStore
 from hydra.core.global_hydra import GlobalHydra
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException, MissingConfigException, OverrideParseException
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig, OmegaConf, read_write
 
 from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS
+from ba_torchrl.core.config import defaults_of
 from ba_torchrl.core.errors import ConfigError, PartError, SettingsError, UnknownNameError
 from ba_torchrl.training.collectors.config import COLLECTORS
 from ba_torchrl.training.grid.launchers.base import LAUNCHERS
@@ -27,6 +28,9 @@ GROUPS = {
     "launcher": LAUNCHERS,
 }
 """By folder of presets in ``configs``, the registry from which they choose."""
+
+_PARTS = ("replay", "rotation")
+"""Parts of an algorithm that have presets of their own."""
 
 _plugin_presets: dict[str, set[str]] = {}
 """By group, the entries of plugins, which are presets."""
@@ -42,7 +46,11 @@ def started(folder: Path) -> Iterator[None]:
 
 @contextmanager
 def composed(
-    folder: Path, name: str, overrides: Sequence[str] = (), further: Path | None = None
+    folder: Path,
+    name: str,
+    overrides: Sequence[str] = (),
+    further: Path | None = None,
+    given: Mapping[str, Any] | None = None,
 ) -> Iterator[DictConfig]:
     """Context, as `started`, with the values of a configuration file.
 
@@ -51,6 +59,7 @@ def composed(
         name: of the file.
         overrides: which presets it takes, in Hydra's grammar, such as ``network=equi``.
         further: folder of configuration files; its file of that name is taken.
+        given: settings over those of the file, whose parts a label has; they are not set here.
 
     Raises:
         ConfigError: there is no such preset, or it cannot be read.
@@ -71,6 +80,8 @@ def composed(
             raise _explained(error) from None
         except ValueError as error:  # a preset that is neither a name nor a list
             raise ConfigError(f"{error}; see --help") from None
+        with read_write(settings.hydra.runtime):
+            _name_parts(settings, given or {}, settings.hydra.runtime.choices)
         HydraConfig.instance().set_config(settings)
         OmegaConf.set_struct(settings, False)  # which settings exist, the models say
         del settings["hydra"]
@@ -78,6 +89,39 @@ def composed(
             yield settings
         finally:
             HydraConfig.instance().cfg = None
+
+
+def _name_parts(
+    settings: DictConfig, given: Mapping[str, Any], choices: MutableMapping[str, Any]
+) -> None:
+    """Name the parts that replace those of presets in the choices of presets, which labels have.
+
+    Args:
+        settings: composed of presets.
+        given: settings over them, such as ``{"network": {"name": "cnn"}}``.
+        choices: Hydra's, by group.
+    """
+    for group, registry in GROUPS.items():
+        own, before = given.get(group), settings.get(group)
+        if group not in choices or not isinstance(own, Mapping):
+            continue
+        name = own.get("name", before.name)
+        if name not in registry:
+            continue  # the model of the settings says so
+        defaults = defaults_of(registry[name])
+        if name != before.name:
+            choices[group] = name
+            choices.update({part: "none" for part in _PARTS if part in before.keys() - defaults})
+        for part, value in own.items():
+            if not isinstance(value, Mapping) or "name" not in value:
+                continue
+            known, chosen = {**defaults, **before}.get(part), value["name"]
+            if isinstance(known, Mapping) and known.get("name") == chosen:
+                continue
+            if part in _PARTS:
+                choices[part] = chosen
+            else:
+                choices[group] += f"_{part}_{chosen}"
 
 
 def register() -> None:
@@ -129,7 +173,7 @@ def preset(group: str, name: str) -> dict[str, Any]:
     has_no_behaviour_term = False
     if first in ("rad", "drq", "ferm") and parts[:1] in (["sac"], ["sacfd"]):
         has_no_behaviour_term = parts.pop(0) == "sac"
-    for other in ("replay", "rotation") if group == "algorithm" else ():
+    for other in _PARTS if group == "algorithm" else ():
         if parts and parts[0] in preset_names(other):
             overrides.append(f"+{other}={parts.pop(0)}")
     if not first or parts:
@@ -155,7 +199,7 @@ def name_presets(error: ConfigError, settings: DictConfig) -> None:
         error.instead = _presets_of(error.kind, error.instead)
         return
     fields = {field.split(".")[0] for field, _ in error.problems}
-    for group in ("replay", "rotation"):
+    for group in _PARTS:
         if group in fields and choices.get(group) not in (None, "uniform", "none"):
             hint = f"{group}={choices[group]} sets it; this algorithm cannot have it"
             error.problems.append((group, hint))
