@@ -6,6 +6,21 @@
 `ENV` stands for the id among the script's arguments. The success flags of the last 20 episodes are
 counted, in training and in the script's own evaluation; the script does not read them. The table
 has the minutes that passed and those of one core, which are fewer on a busy machine.
+
+docs/torchrl.md has the command for TorchRL's SAC and the success rates. The other scripts had these
+settings:
+
+    TD3, TorchRL      as SAC, without optim.alpha_init
+    CrossQ, TorchRL   as SAC, without optim.lr and optim.target_update_polyak, with
+                      env.library=gymnasium 'network.critic_hidden_sizes=[256,256]'
+                      network.warmup_steps=1000
+    PPO, TorchRL      env.env_name=ENV logger.backend= optim.device=cpu optim.lr=1e-3
+                      loss.gamma=0.95 collector.frames_per_batch=1024 collector.total_frames=40960
+    SAC, CleanRL      --gamma 0.95 --policy-lr 1e-3 --tau 0.02 --batch-size 128
+                      --learning-starts 500
+    SAC, Stable-Baselines3
+                      gamma=0.95 learning_rate=1e-3 tau=0.02 ent_coef="auto_0.1" batch_size=128
+                      learning_starts=500
 """
 
 from __future__ import annotations

@@ -14,7 +14,15 @@ from tensordict import TensorDict
 from tensordict.nn import TensorDictModule
 from torchrl import collectors, envs
 from torchrl.checkpoint import Checkpoint
-from torchrl.data import LazyTensorStorage, TensorDictReplayBuffer
+from torchrl.data import (
+    LazyTensorStorage,
+    MultiStep,
+    TensorDictMaxValueWriter,
+    TensorDictReplayBuffer,
+)
+from torchrl.modules import QValueActor
+from torchrl.objectives import DQNLoss, HardUpdate
+from torchrl.trainers import ReplayBufferTrainer
 
 import ba_torchrl
 from ba_torchrl.core import keys
@@ -248,3 +256,46 @@ def test_a_script_for_gymnasium_is_measured_by_the_success_flag(tmp_path, monkey
     _, _, row = capsys.readouterr().out.splitlines()
     assert row.split(" | ")[1] == "1.00 of 2"
     assert len(log.read_text().splitlines()) == 3
+
+
+def test_multi_step_of_torchrl_loses_the_end_inside_its_window():
+    ends = torch.tensor([False, False, True])[None, :, None]
+    reward = torch.tensor([0.0, 0.0, 1.0])[None, :, None]
+    state = torch.arange(4.0)[None, :, None]
+    following = {"observation": state[:, 1:], "reward": reward, "done": ends, "terminated": ends}
+    steps = TensorDict({"observation": state[:, :-1], "next": following}, [1, 3])
+    steps = MultiStep(gamma=0.5, n_steps=3)(steps)
+    assert steps["next", "reward"].flatten().tolist() == [0.25, 0.5, 1.0]  # all hold the end
+    assert steps["next", "terminated"].flatten().tolist() == [False, False, True]
+
+
+def test_the_hard_update_of_torchrl_copies_a_step_late():
+    actor = QValueActor(torch.nn.Linear(1, 2, bias=False), action_space="categorical")
+    loss = DQNLoss(actor, action_space="categorical", delay_value=True)
+    updater, copied = HardUpdate(loss, value_network_update_interval=3), []
+    (weight,), (target,) = loss.parameters(), loss.target_value_network_params.values(True, True)
+    for step in range(1, 13):
+        weight.data += 1
+        updater.step()
+        copied += [step] if torch.equal(weight, target) else []
+    assert copied == [4, 8, 12]
+
+
+def test_a_maximum_value_writer_of_torchrl_with_a_nested_key_is_restored_unusable(tmp_path):
+    def make():
+        writer = TensorDictMaxValueWriter(rank_key=("next", "reward"))
+        return TensorDictReplayBuffer(storage=LazyTensorStorage(4), writer=writer)
+
+    data, buffer, restored = TensorDict({"next": {"reward": [[1.0], [2.0]]}}, [2]), make(), make()
+    buffer.extend(data.clone())
+    buffer.dumps(tmp_path)
+    restored.loads(tmp_path)
+    with pytest.raises(KeyError, match="Only NestedKeys are supported"):
+        restored.extend(data.clone())
+
+
+def test_the_replay_trainer_of_torchrl_truncates_every_step():
+    replay = TensorDictReplayBuffer(storage=LazyTensorStorage(5), batch_size=5)
+    batch = TensorDict({"next": {"truncated": torch.zeros(5, 1, dtype=torch.bool)}}, [5])
+    ReplayBufferTrainer(replay, flatten_tensordicts=True).extend(batch)
+    assert replay["next", "truncated"].all()
