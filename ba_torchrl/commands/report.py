@@ -92,7 +92,7 @@ def completed(runs: Iterable[Run]) -> list[Run]:
 
 def changes(run: RunResult) -> dict[str, tuple[Any, Any]]:
     """Return the settings in which a run differs from the package's benchmark of its name."""
-    if not (config_dir() / "benchmark" / f"{run.benchmark}.yaml").exists():
+    if run.benchmark not in [file.stem for file in (config_dir() / "benchmark").glob("*.yaml")]:
         return {}
     planned = _planned(run.benchmark).get((run.task, run.label))
     if planned is None:

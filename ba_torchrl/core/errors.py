@@ -136,6 +136,10 @@ class DamagedFilesError(ConfigError):
     """Files that are incomplete or altered; the message names the first one."""
 
 
+class OtherRunError(ConfigError):
+    """A folder that holds a run with other settings, or of another version of its task."""
+
+
 class InvalidActionError(ValueError):
     """An action of the wrong shape, or one that is not finite."""
 

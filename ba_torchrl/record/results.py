@@ -297,7 +297,7 @@ def file_of(folder: Path, result: RunResult, name: str) -> Path | None:
     if name not in result.files:
         return None
     path, root = (folder / result.files[name]).resolve(), folder.resolve()
-    return path if path.is_relative_to(root) and path.is_file() else None
+    return path if path.is_relative_to(root) and os.path.isfile(path) else None  # or a long name
 
 
 def run_folders(roots: Iterable[str | Path]) -> tuple[list[Path], list[Path]]:

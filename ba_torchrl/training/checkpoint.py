@@ -33,7 +33,7 @@ from torchrl.checkpoint import (
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner
 from ba_torchrl.core.config import Which
-from ba_torchrl.core.errors import ConfigError, DamagedFilesError, check_choice
+from ba_torchrl.core.errors import ConfigError, DamagedFilesError, OtherRunError, check_choice
 from ba_torchrl.core.files import (
     OLD,
     RENAMED,
@@ -115,20 +115,20 @@ def check_same_run(
             be any.
 
     Raises:
-        ConfigError: it has not; the message names every difference.
+        OtherRunError: it has not; the message names every difference.
     """
     started = started or read_config(config.folder, device=config.device)
     found = differences(started.resolved(), config.resolved())
     if found:
         lines = [f"{name}: {old!r} there, {new!r} now" for name, (old, new) in found.items()]
-        raise ConfigError(
+        raise OtherRunError(
             f"the run in {config.folder} was started with other settings; choose another folder, "
             "or continue it as it was by run_dir= and resume=true alone:"
             + "\n  ".join(["", *lines])
         )
     there, here = there or read_versions(config.folder), versions_of(config.task)
     if there.task != here.task or there.expert not in (None, here.expert):
-        raise ConfigError(
+        raise OtherRunError(
             f"the run in {config.folder} was started with {there} of {config.task}, here are "
             f"{here}: choose another folder, or use the package that started it"
         )

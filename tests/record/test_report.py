@@ -379,7 +379,8 @@ def test_a_run_of_somebody_else_imports_and_copies_nothing_from_outside_its_fold
     write_run(Path("runs/a"), (0.1, 0.6), config=config, files=files, benchmark=None)
     write_run(Path("runs/b"), (0.1, 0.6), config=config, files=files, benchmark=None, seed=1)
     pasted = "x]'; rm -rf /; '"
-    write_run(Path("runs/c"), (0.1,), config={"plugins": [pasted]}, label="\x00\x1b[31m", final=0.5)
+    own = {"config": {"plugins": [pasted]}, "files": {"video": "long" * 99}}
+    write_run(Path("runs/c"), (0.1,), **own, label="\x00\x1b[31m", final=0.5)
     Path("runs/a/film.mp4").symlink_to("../../secret.mp4")
     Path("runs/b/own.mp4").write_text("own")
     Path("runs/b/film.mp4").symlink_to("own.mp4")
@@ -488,7 +489,8 @@ def test_runs_are_compared_with_the_benchmark_of_the_package(tmp_path):
     assert changes(total_updates=updates + 1) == {"total_updates": (updates + 1, updates)}
     (listed,) = report.changes(run.model_copy(update={"label": "sac cnn"}))
     assert listed == "tasks, algorithms and networks"
-    assert report.changes(run.model_copy(update={"benchmark": "mine"})) == {}
+    for name in ("mine", "../train", "long" * 99):
+        assert report.changes(run.model_copy(update={"benchmark": name})) == {}
 
 
 def test_a_report_is_a_folder_with_curves_tables_and_a_page(tmp_path):

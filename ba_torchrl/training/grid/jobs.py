@@ -20,6 +20,7 @@ from pathlib import Path
 
 from tqdm import tqdm
 
+from ba_torchrl.core.errors import OtherRunError
 from ba_torchrl.core.files import write_text
 from ba_torchrl.record.logging import FILE_INTERVAL_S, last_step
 from ba_torchrl.record.results import FAILURE_FILE, now
@@ -57,14 +58,15 @@ def run_all(
             argument is the run's folder, so that lists of processes name it.
 
     Returns:
-        By run folder, the reason of its failure. Runs that another process runs are left to it.
+        By run folder, the reason of its failure, also of a run whose files cannot be read. Runs
+        that another process runs are left to it.
 
     Raises:
-        ConfigError: a folder holds a run with other settings, in which case nothing was started.
+        OtherRunError: a folder holds a run with other settings, in which case nothing was started.
     """
-    waiting = deque(unfinished(runs))
+    to_start, failures = unfinished(runs)
+    waiting = deque(to_start)
     running: list[_Job] = []
-    failures: dict[Path, str] = {}
     bar = tqdm(
         total=len(runs),
         initial=len(runs) - len(waiting),
@@ -105,13 +107,23 @@ def run_all(
     return failures
 
 
-def unfinished(runs: Sequence[ExperimentConfig]) -> list[ExperimentConfig]:
-    """Return the runs to start: those that are not finished and that no other process runs."""
+def unfinished(
+    runs: Sequence[ExperimentConfig],
+) -> tuple[list[ExperimentConfig], dict[Path, str]]:
+    """Return the runs to start, which are not finished and which no other process runs; and, by
+    folder, why a run is left out whose files cannot be read. `OtherRunError` if a folder holds a
+    run with other settings."""
     states = [(run, status(run)) for run in runs]
+    unreadable = {run.folder: found.detail for run, found in states if found.state == "unreadable"}
     for run, found in states:
+        if found.state == "other":
+            raise OtherRunError(found.detail)
         if found.state == "running":
             _report_skipped(run, found.detail)
-    return [run for run, found in states if found.state not in ("done", "running")]
+    for reason in unreadable.values():
+        tqdm.write(f"left out: {reason}")
+    left = [run for run, found in states if found.state in ("missing", "interrupted", "failed")]
+    return left, unreadable
 
 
 def record_failure(run: ExperimentConfig, reason: str) -> None:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 from pydantic import Field
 
 from ba_torchrl.core.config import Chosen, LocalPath, StrictModel, parse
-from ba_torchrl.core.errors import ConfigError, UnknownNameError
+from ba_torchrl.core.errors import ConfigError, OtherRunError, UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
     CONFIG_FILE,
@@ -35,7 +35,8 @@ SET_BY_THE_GRID = ("task", "seed", "label", "run_dir", "resume", "benchmark")
 Overrides = dict[str, dict[str, Any]]
 Preset = Callable[[Literal["algorithm", "network"], str], dict[str, Any]]
 """From a group and a name to the values of that preset file; raises with the known names."""
-State = Literal["done", "running", "interrupted", "failed", "missing"]
+State = Literal["done", "running", "interrupted", "failed", "missing", "unreadable", "other"]
+"""State of a run. "other": its folder holds a run with other settings."""
 
 
 class BenchmarkConfig(StrictModel):
@@ -120,7 +121,7 @@ class Status:
     """Wall time of a run that is done."""
 
     def __str__(self) -> str:
-        return f"{self.state}: {self.detail}" if self.detail else self.state
+        return f"{self.state}: {' '.join(self.detail.split())}" if self.detail else self.state
 
 
 def plan(
@@ -215,7 +216,16 @@ def expand(
 
 
 def status(run: ExperimentConfig) -> Status:
-    """Return the state of a run. One whose files are damaged has failed."""
+    """Return the state of a run, whatever its folder holds."""
+    try:
+        return _status(run)
+    except OtherRunError as error:
+        return Status("other", str(error))
+    except (ConfigError, OSError) as error:
+        return Status("unreadable", f"{error}; delete {run.folder} to start the run again")
+
+
+def _status(run: ExperimentConfig) -> Status:
     from ba_torchrl.training.checkpoint import (
         check_same_run,
         parse_saved,
@@ -226,21 +236,14 @@ def status(run: ExperimentConfig) -> Status:
 
     folder = run.folder
     if (folder / RESULT_FILE).exists():
-        try:
-            result = read_result(folder)
-        except ValueError as error:
-            return Status("failed", f"{error}; delete the folder to start the run again")
+        result = read_result(folder)
         # settings that are newer than the run have their defaults
         started = parse_saved(result.config, folder / RESULT_FILE, device=run.device)
         check_same_run(run, started, Versions(result.task_version, result.expert_version))
         success = f"success {result.last.success_rate:.2f}"
         return Status("done", success, result.seconds)
     if (folder / CONFIG_FILE).exists():
-        try:
-            started = read_config(folder, device=run.device)
-        except ConfigError as error:
-            return Status("failed", f"{error}; delete the folder to start the run again")
-        check_same_run(run, started)
+        check_same_run(run, read_config(folder, device=run.device))
     holder = run_holder(folder)
     if holder is not None:
         return Status("running", holder)

@@ -3,6 +3,7 @@
 import functools
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,7 +14,7 @@ import pytest
 
 from ba_torchrl.commands.benchmark import print_estimate
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.record.results import RunResult, read_result
+from ba_torchrl.record.results import RunResult, read_result, write_result
 from ba_torchrl.tasks.base import TASKS
 from ba_torchrl.training.checkpoint import lock_run
 from ba_torchrl.training.grid import jobs
@@ -121,8 +122,8 @@ def test_a_setting_that_is_newer_than_a_finished_run_has_its_default_there(tmp_p
     assert status(run).state == "done"
     saved["config"]["env"]["reward"] = "dense"
     path.write_text(json.dumps(saved))
-    with pytest.raises(ConfigError, match=r"env\.reward: 'dense' there, 'sparse' now"):
-        status(run)
+    assert status(run).state == "other"
+    assert "env.reward: 'dense' there, 'sparse' now" in status(run).detail
 
 
 @pytest.mark.parametrize("name", ["version", "expert_version"])
@@ -131,8 +132,7 @@ def test_a_finished_run_of_another_version_is_refused(tmp_path, fake, monkeypatc
     fake([run])
     assert status(run).state == "done"
     monkeypatch.setattr(TASKS[run.task], name, 7)
-    with pytest.raises(ConfigError, match=r"here are .* version 7.*: choose another folder"):
-        status(run)
+    assert re.search(r"^other: .* here are .* version 7.*: choose another", str(status(run)))
     path = run.folder / "result.json"
     saved = json.loads(path.read_text())
     saved |= {"task_version": TASKS[run.task].version, "expert_version": None}
@@ -234,6 +234,7 @@ def test_an_interruption_asks_each_job_once_and_waits_for_all(tmp_path, monkeypa
 def test_a_folder_with_other_settings_is_refused_before_anything_starts(tmp_path, fake):
     fake(planned(tmp_path, seeds=1))
     changed = planned(tmp_path, seeds=2, common={"total_updates": 8})
+    assert [status(run).state for run in changed] == ["other", "missing"]
     with pytest.raises(ConfigError, match="total_updates: 6 there, 8 now"):
         fake(changed)
     assert calls(changed[1]) == 0
@@ -273,24 +274,45 @@ def test_a_run_that_still_works_is_skipped_by_the_name_of_its_process(tmp_path, 
 
 
 @pytest.mark.parametrize(
-    ("name", "detail"),
-    [
-        ("result.json", "delete the folder"),
-        ("failure.json", "failure.json is damaged"),
-        ("config.json", "config.json"),
-    ],
+    ("name", "state"),
+    [("result.json", "unreadable"), ("failure.json", "failed"), ("config.json", "unreadable")],
 )
-def test_a_damaged_file_concerns_its_run_only(tmp_path, fake, name, detail):
+def test_a_damaged_file_concerns_its_run_only(tmp_path, fake, name, state):
     runs = planned(tmp_path)
     fake(runs[1:])
     runs[0].folder.mkdir(parents=True)
-    for content in (b"", b'{"task": "clo', b"\x80\x04\x95", b"[]"):
+    for content in (b"", b'{"task": "clo', b"\x80\x04\x95", b"[]", b"{}"):
         (runs[0].folder / name).write_bytes(content)
-        assert [status(run).state for run in runs] == ["failed", "done"]
-        assert detail in status(runs[0]).detail
+        assert [status(run).state for run in runs] == [state, "done"]
+        assert name in status(runs[0]).detail
     page = write([tmp_path], tmp_path / "report")
-    text = {"result.json": "result.json has no valid result", "failure.json": detail}
+    text = {"result.json": "result.json has no valid result", "failure.json": "is damaged"}
     assert text.get(name, "") in (page.parent / "table.md").read_text()
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"algorithm": {"name": "theirs"}}, "unknown algorithm 'theirs'"),
+        ({"algorithm": {"name": ["sac"]}}, "unknown algorithm ['sac']"),
+        ({"plugins": ["antigravity"]}, "uses the plugins [antigravity]"),
+        ({"new": 1}, "unknown parameter 'new'"),
+        (None, "Not a directory"),  # a file has the name of the folder
+    ],
+)
+def test_a_run_that_cannot_be_read_is_left_out_and_named(tmp_path, fake, capsys, changes, reason):
+    first, other = planned(tmp_path)
+    first.folder.parent.mkdir(parents=True)
+    if changes is None:
+        first.folder.touch()
+    else:
+        result = result_of(first)
+        write_result(first.folder, result.model_copy(update={"config": result.config | changes}))
+    failures = fake([first, other])
+    assert [status(run).state for run in (first, other)] == ["unreadable", "done"]
+    assert reason in failures[first.folder]
+    assert f"; delete {first.folder} to start the run again" in failures[first.folder]
+    assert f"left out: {failures[first.folder]}" in capsys.readouterr().out
 
 
 @pytest.mark.slow

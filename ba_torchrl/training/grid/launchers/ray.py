@@ -26,7 +26,7 @@ _FOREVER_S = 1e6
 
 def run_all(config: RayLauncherConfig, grid: Grid) -> dict[Path, str]:
     """Run the unfinished runs; see `LauncherConfig.run_all`."""
-    waiting = unfinished(grid.runs)
+    waiting, failures = unfinished(grid.runs)
     ray = connected_ray(config.address)
     check_resources("launcher", config.cpus, config.gpus)
     task = ray.remote(
@@ -41,7 +41,6 @@ def run_all(config: RayLauncherConfig, grid: Grid) -> dict[Path, str]:
         where = {"run_dir": str(run.folder.resolve())}
         pickled = pickle.dumps(run.model_copy(update=where))
         pending[task.remote(run.folder.resolve(), pickled, grid.max_hours)] = run
-    failures: dict[Path, str] = {}
     bar = tqdm(total=len(grid.runs), initial=len(grid.runs) - len(waiting), unit="run")
     try:
         while pending:
