@@ -187,7 +187,7 @@ class Learner(ABC):
         return []
 
     def make_optimizer(self, loss: LossModule) -> Optimizer:
-        """Return the optimiser of all terms of the loss but those of `make_term_optimizers`."""
+        """Return the optimiser of the loss's terms that have none of `make_term_optimizers`."""
         return self.adam(loss.parameters(), loss)
 
     def make_term_optimizers(self, loss: LossModule) -> Mapping[str, Mapping[str, Optimizer]]:
@@ -197,8 +197,8 @@ class Learner(ABC):
 
     def make_stepper(self, optimizer: Optimizer, loss: LossModule) -> OptimizationStepper:
         """Return what takes the gradient steps of an update: by default all optimisers with their
-        schedules. One of TorchRL's takes a step of `optimizer` on the sum of all stages, without a
-        schedule."""
+        schedules. A stepper of TorchRL takes a step of `optimizer` on the sum of all stages,
+        without a schedule."""
         return Optimizers(
             optimizer,
             self.make_term_optimizers(loss),
@@ -214,8 +214,8 @@ class Learner(ABC):
     def adam(
         self, parameters: Iterable[nn.Parameter], loss: LossModule, factor: float = 1.0
     ) -> Optimizer:
-        """Return Adam for some parameters of a loss with a factor on the learning rate, and with
-        weight decay on those of the networks only."""
+        """Return Adam for some parameters of a loss; ``factor`` scales the learning rate, and only
+        the parameters of networks have weight decay."""
         return self.config.optimizer.adam(parameters, self.network_parameters(loss), factor)
 
     def network_parameters(self, loss: LossModule) -> list[nn.Parameter]:
@@ -225,13 +225,13 @@ class Learner(ABC):
     # -- data --------------------------------------------------------------------------------
 
     def nearest_action(self, action: Tensor) -> Tensor:
-        """Return the actions nearest to given ones [..., A] among those that the policy can choose;
-        by default it can choose all. Demonstrations execute what is learnt: these actions."""
+        """Return the nearest action that the policy can choose, for each action [..., A]; by
+        default the action itself. Demonstrations execute what is learned: these actions."""
         return action
 
     @property
     def equal_moves(self) -> int:
-        """Number of actions any of which is imitated; by default 0, for one action alone."""
+        """Largest number of equal moves, any of which is imitated; by default 0, for one action."""
         return 0
 
     def to_transitions(self, data: TensorDictBase, *, is_demonstration: bool) -> TensorDict:
@@ -298,7 +298,7 @@ class Learner(ABC):
         self.replay.update_tensordict_priority(TensorDict(errors, [len(errors["index"])]))
 
     def minimize(self, batch: TensorDictBase, stages: Sequence[LossFunction]) -> TensorDict:
-        """Take the steps of `step`, with its arguments and result, and count the update."""
+        """Call `step` with these arguments, count the update, and return what `step` returns."""
         before = len(self.host_tasks)
         scalars = self.step(batch, stages)
         if self.averaged_policy is not None:

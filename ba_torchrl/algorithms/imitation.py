@@ -37,7 +37,7 @@ class BC(Learner):
 
     @property
     def equal_moves(self) -> int:
-        """Number of actions any of which is imitated; 0 for the expert's own alone."""
+        """Largest number of equal moves, any of which is imitated; 0 for the expert's own alone."""
         return self.problem.equal_moves if self.config.equal_moves else 0
 
     @property

@@ -84,7 +84,7 @@ class Optimizers(OptimizationStepper):
         self.schedulers = {name: make_scheduler(each) for name, each in self._named.items()}
 
     def step(self, trainer: Update | Trainer, sub_batch: TensorDictBase) -> TensorDict:
-        """Take a gradient step on the sum of losses of each stage, then one of the schedules.
+        """Take a gradient step per stage, on the sum of its losses, then step the schedules.
 
         Args:
             trainer: computes the losses; those of TorchRL's trainer are a single stage. A stage is

@@ -64,7 +64,7 @@ def processor() -> str:
 
 
 def hardware(device: torch.device) -> dict[str, Any]:
-    """Return a description of the hardware of a run with its learner on ``device``."""
+    """Return processor, cores, memory and GPU of a run whose learner is on ``device``."""
     gpu = torch.cuda.get_device_name(device) if device.type == "cuda" else None
     return {
         "cpu": processor(),

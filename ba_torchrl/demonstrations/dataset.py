@@ -74,7 +74,7 @@ class BulletArmExperienceReplay(BaseDatasetExperienceReplay):
 
     @staticmethod
     def available_datasets(root: str | Path = ".") -> list[str]:
-        """Return the ids of the folders of demonstrations below a folder."""
+        """Return the ids of the demonstrations that lie below a folder."""
         found = (path.parent.relative_to(root) for path in Path(root).rglob(METADATA_FILE))
         hidden = (".",)  # those that are being written
         return sorted(

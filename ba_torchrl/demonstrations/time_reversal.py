@@ -183,7 +183,7 @@ class ReplayScores(NamedTuple):
 
 
 def replay_scores(task: str, episodes: int, *, seed: int = 0, **config: Any) -> ReplayScores:
-    """Play deconstruction episodes, each followed by its inverse actions from its last state."""
+    """Take structures apart, play the reversed actions, and return how often they build again."""
     env = make_deconstruction_env(task, **{**config, "seed": seed, "expert": True})
     lengths, reached = [], 0
     try:

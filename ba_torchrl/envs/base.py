@@ -154,7 +154,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     @property
     @abstractmethod
     def action_limits(self) -> ActionLimits:
-        """Displacement and rotation of one action."""
+        """Largest displacement and rotation of one action."""
 
     @property
     @abstractmethod
@@ -257,7 +257,7 @@ class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):
     def video_images(
         self, width: int, height: int, *, at_contact: bool = False
     ) -> Iterator[np.ndarray]:
-        """Yield the images of a video, [height, width, 3] uint8, from the last call until now.
+        """Yield a video's images since the last call, [height, width, 3] uint8.
 
         They have no effect on the simulation. The first call follows `reset`, the others each step.
 

@@ -119,7 +119,7 @@ def _span(limits: tuple[float, float]) -> str:
 
 
 def describe(task: str) -> TaskDescription:
-    """Return the description of a task, with its default parameters."""
+    """Return a task's objects, goal, spaces and expert's scores, for its default parameters."""
     from ba_torchrl.envs.factory import make  # imports torch
 
     cls = TASKS[task]

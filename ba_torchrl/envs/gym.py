@@ -81,7 +81,7 @@ class GymEnv(gymnasium.Env[Observation, np.ndarray]):
 
     @property
     def spec(self) -> EnvSpec | None:
-        """What ``gymnasium.make`` made it from, with the step limit of the environment."""
+        """The specification that ``gymnasium.make`` read, with the environment's step limit."""
         return self._spec
 
     @spec.setter
@@ -246,7 +246,7 @@ class ExpertPolicy:
         episode_start: Any = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """Return the expert's action [A], of a vector [environments, A]; and ``state``.
+        """Return the expert's action, [A] or in a vector [environments, A], and ``state``.
 
         Args:
             observation: one, or a batch with one for each environment; its values are not read.

@@ -41,7 +41,7 @@ tilted during actions only."""
 
 
 class Observation(ABC):
-    """Entries that are added to every observation."""
+    """Base of all optional entries, which are added to every observation."""
 
     parameter: ClassVar[str | None] = None
     """Field of `EnvConfig` that enables the observation, in addition to `observations`."""

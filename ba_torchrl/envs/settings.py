@@ -44,7 +44,7 @@ CONTROLS: Registry[type[ControlConfig]] = Registry(
 
 @dataclass(frozen=True)
 class ResolvedEnv:
-    """A task and the parameters of its environment, which `resolve_env` returns.
+    """A task and all parameters of its environment, defaults filled in; see `resolve_env`.
 
     Another process that unpickles it imports `modules` first.
     """
@@ -60,7 +60,7 @@ class ResolvedEnv:
 
     @property
     def given(self) -> dict[str, Any]:
-        """The parameters that are not defaults of the task or the control."""
+        """The parameters that were given, without the defaults of task and control."""
         return self.config.model_dump(exclude_unset=True)
 
     @property
@@ -70,7 +70,7 @@ class ResolvedEnv:
 
     @property
     def control(self) -> type[ControlConfig]:
-        """What the task's control declares."""
+        """The declarations of the task's control, close loop or open loop."""
         return CONTROLS[self.task_class.control]
 
     @property
@@ -102,11 +102,11 @@ class ResolvedEnv:
         )
 
     def changed(self, **changes: Any) -> ResolvedEnv:
-        """Return the parameters with changes, resolved anew."""
+        """Return a copy in which some parameters have other values, resolved anew."""
         return resolve_env(self, changes)
 
     def check_spawned_process_knows(self) -> None:
-        """Check that a spawned process can import what registers the parts of the environment."""
+        """Check that a spawned process can import the modules of the environment's parts."""
         for registry, name, module in _plugins(self.task_id, self.config):
             if module in MAIN:
                 check_spawned_process_knows(registry.kind, name)

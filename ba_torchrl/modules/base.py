@@ -25,7 +25,7 @@ LOG_STD_MIN, LOG_STD_MAX = -20.0, 2.0
 
 @dataclass(frozen=True)
 class ActorCriticSpec:
-    """Images and actions that an actor-critic network is built for.
+    """What an actor-critic network is built for: images, vectors and action.
 
     Args:
         images: declarations of the network's input images, by key, in the order of its arguments.
@@ -93,7 +93,7 @@ class Frames(NamedTuple):
 
 @dataclass(frozen=True)
 class ActorCritic:
-    """The three plain modules of a Soft Actor-Critic, for any leading batch shape, even none.
+    """Actor, encoder and critic of a Soft Actor-Critic, for any leading batch shape or none.
 
     Iterating over it gives the modules.
     """

@@ -36,7 +36,7 @@ class LevelValues(Protocol):
         ...
 
     def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values [B, N] of each level, and which choices belong to one of K actions,
+        """Return the values [B, N] of each level, and which choices lead to any of K actions,
         bool [B, N]; only losses of sets of actions ask.
 
         The values of a level, and the actions that count there, are those after the choice of the
@@ -45,7 +45,7 @@ class LevelValues(Protocol):
         ...
 
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the greedy choices [B, n], level after level, and the last one's value [B, 1]."""
+        """Return the greedy choices [B, n], level after level, and the last level's value [B, 1]."""
         ...
 
     def value_of(self, *observation_and_choices: Tensor) -> Tensor:

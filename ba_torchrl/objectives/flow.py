@@ -26,7 +26,7 @@ class ChunkNetwork(Protocol):
 
 
 class FlowMatchingLoss(ImitationLoss):
-    """The squared error of the predicted clean chunk at random times of a rectified flow.
+    """Imitation of action chunks by a rectified flow: the squared error of the predicted chunk.
 
     For each chunk x of the data, noise n ~ N(0, 1) and a time t ~ U(0, 1) are drawn, and the
     network predicts x from (1 - t) n + t x. TorchRL's ``DiffusionBCLoss`` predicts the noise of a

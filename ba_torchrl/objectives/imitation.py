@@ -54,7 +54,7 @@ class ImitationLoss(EvalModeTargetsLoss):
 
 
 class BehaviourCloningLoss(ImitationLoss):
-    """Behaviour cloning of a stochastic policy: the distance of an action drawn from it.
+    """Behaviour cloning of a stochastic policy: the distance of its sampled action to the expert's.
 
     The mean over the batch of the `action_distance` of a ~ pi, drawn with gradient, from the
     expert's action a_e, plus w log pi(a). With "mse", which is the behaviour term of SACfD

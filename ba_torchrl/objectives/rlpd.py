@@ -14,7 +14,7 @@ from ba_torchrl.objectives.sacfd import SACfDLoss
 
 
 class RLPDLoss(SACfDLoss):
-    """`SACfDLoss` with K critics.
+    """RLPD: `SACfDLoss` with K critics, whose targets are the least of a random subset.
 
     With a random subset M of the target critics, drawn in each call for the whole batch, two terms
     differ from `SACfDLoss`::

@@ -124,7 +124,7 @@ class PolicyTest(StrictModel):
 
 
 class Machine(StrictModel):
-    """What something was computed on."""
+    """Hardware and package versions with which something was computed."""
 
     hardware: dict[str, Any]
     """As in `RunResult`."""

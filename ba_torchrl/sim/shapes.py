@@ -164,7 +164,7 @@ class MeshLists(NamedTuple):
 
 
 def mesh_lists(mesh: Mesh) -> MeshLists:
-    """Return the lists of a mesh; those of equal meshes are the same objects.
+    """Return the lists of a mesh; equal meshes share the same lists.
 
     PyBullet never releases the vertices and normals that are passed to it, so that new lists for
     each world would fill the memory.

@@ -26,7 +26,7 @@ from ba_torchrl.sim.shapes import Color, Shape
 
 
 class Snapshot:
-    """A state of a world, for worlds with the same bodies in this or another process.
+    """A saved state, which any world with the same bodies can load, also in another process.
 
     It is in bytes and, to restore the world that it is of in less time, in PyBullet's memory, which
     is freed when this object is deleted. The connection is the finalizer of that world.
@@ -380,7 +380,7 @@ def _disconnect(client: int) -> None:
 
 @contextlib.contextmanager
 def loading(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Replace PyBullet's error, which gives no reason, by one that does.
+    """Replace PyBullet's error, which gives no reason, by an error with the reason.
 
     Raises:
         OSError: the file cannot be opened: it is missing, or too many files are open.

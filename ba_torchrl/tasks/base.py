@@ -62,7 +62,7 @@ class TaskSettings:
 
 
 class Task(ABC):
-    """Bodies, their random poses, the goal, and an expert that reaches it.
+    """Base of all tasks: bodies, their random poses, a goal, and an expert that reaches it.
 
     The constructor loads the bodies, once per world; every episode calls `initialize_episode`.
     Only `evaluate` tests the goal.

@@ -48,7 +48,7 @@ JUMP_EPISODES = 3
 
 
 class ExpertReport(NamedTuple):
-    """The results of an expert from random starts, and what they say about imitation."""
+    """How often an expert succeeds, in how many steps, and whether a policy can imitate it."""
 
     task: str
     """Id of the task."""

@@ -41,7 +41,7 @@ def run_test(
     on_episode: Callable[[TensorDict], None] | None = None,
     first_seed: int = FIRST_TEST_SEED,
 ) -> PolicyTest:
-    """Play the first episodes of a test greedily; the weights stay constant.
+    """Test a policy: play the protocol's first episodes greedily, with constant weights.
 
     The result does not depend on the environments' number and processes: the policy acts on batches
     of `ROWS`, since a network computes other last bits for another batch size.

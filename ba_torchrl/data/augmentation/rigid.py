@@ -84,7 +84,7 @@ class ActionGrid(Protocol):
 
 
 class RigidAugmentation(SeededTransform):
-    """Applies a random rigid transform to images, next images and one action of each transition.
+    """Turns, mirrors or shifts sampled transitions at random: both images and one action.
 
     Images with the gripper's axes do not change, with two exceptions: a reflection reverses the
     gripper's y axis, and a yaw that is wrapped into half a turn, or rounded to the other end of it,

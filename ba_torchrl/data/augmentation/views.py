@@ -72,7 +72,7 @@ class CenterCrop(Transform):
         self.size = size
 
     def transform_observation_spec(self, observation_spec: Composite) -> Composite:
-        """Return the specification with the parts."""
+        """Return the specification with the sizes of the central parts."""
         for key, out_key in zip(self.in_keys, self.out_keys, strict=True):
             observation_spec[out_key] = mapped_bounds(observation_spec[key], self._apply_transform)
         return observation_spec
@@ -112,7 +112,7 @@ def cropped_images(images: Mapping[str, ImageSpec], size: int) -> dict[str, Imag
 
 
 class RandomViews(SeededTransform):
-    """Replaces the images of transitions by random views of them.
+    """Shifts or crops the images of sampled transitions at random.
 
     With one view of the image and one of the next image, both have the same offset (RAD: Laskin et
     al., "Reinforcement Learning with Augmented Data", 2020). With several, every view has its own

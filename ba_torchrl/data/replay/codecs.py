@@ -77,11 +77,10 @@ def mapped_bounds(spec: Bounded, transform: Callable[[Tensor], Tensor]) -> Bound
 
 
 class ImageCodecs(Transform):
-    """Images as the replay returns them.
+    """Rounds images as the replay does, so that a policy sees in acting what it learns from.
 
-    An image gets the values that it has after storage: in a `TransformedEnv`, whose policy then
-    sees what it learns from, in a replay, and called on an observation. Codes are decoded. In a
-    replay, the next images too.
+    It works in a `TransformedEnv`, in a replay (where it rounds next images too), and called on an
+    observation. Codes are decoded.
 
     Args:
         images: declarations by key.
@@ -115,7 +114,7 @@ class ImageCodecs(Transform):
         self.device = device
 
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
-        """Replace images, and next images if there are any, by those of the replay."""
+        """Round images, and next images if there are any, as the replay does."""
         if self.device is not None:
             tensordict.clear_device_()
         return self._map(tensordict, self.in_keys, self._stored)

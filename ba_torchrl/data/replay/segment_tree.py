@@ -163,7 +163,7 @@ _REPLACEMENTS = {
 
 
 def use_python_segment_trees() -> None:
-    """Let TorchRL's prioritised samplers use these trees where its native ones did not load.
+    """Give TorchRL's prioritised samplers trees in NumPy if the native trees did not load.
 
     This sets names of a module of TorchRL. `ExpertPrioritizedSampler` works without it.
     """

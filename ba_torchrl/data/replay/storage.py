@@ -162,7 +162,7 @@ class FrameTable:
 
 
 class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
-    """A TorchRL storage that stores an image once, also where it is both an image and a next image.
+    """A TorchRL storage that keeps an image once, even if two transitions share it.
 
     All other entries are ordinary columns. Images are stored as codes of their codec, compressed
     without loss; the error of a returned image is the codec's error.
@@ -295,7 +295,7 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
 
     @property
     def columns(self) -> TensorDictBase:
-        """Views of all entries but the images, of all stored transitions; needs a first one."""
+        """Views of the stored entries, images left out; at least one transition must be stored."""
         return super().get(slice(None))
 
     @property

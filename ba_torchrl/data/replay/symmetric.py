@@ -18,7 +18,7 @@ _SIDES = ("expert", "online")
 
 
 class SymmetricSampler(OneProcess, StateFolder, Sampler):
-    """Half of every batch from demonstrations, half from online transitions (appendix G.1).
+    """Draws half of every batch from demonstrations, half from online transitions (appendix G.1).
 
     Each half is drawn uniformly, with replacement, demonstrations first. While there are none of
     one kind, the whole batch is drawn from the other. A batch of odd size has one demonstration

@@ -53,7 +53,7 @@ class ExpertKeepingWriter(TensorDictRoundRobinWriter):
         return int(self.extend(data.unsqueeze(0)))
 
     def extend(self, data: TensorDictBase) -> Tensor:
-        """Write transitions: all demonstrations, and as many of the newest others as fit.
+        """Write all demonstrations, and as many of the newest other transitions as fit.
 
         Args:
             data: transitions [N]; their entry "index" is set.

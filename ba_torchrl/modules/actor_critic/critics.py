@@ -99,7 +99,7 @@ class EnsembleCritic(XavierInitialised):
 
 
 class ActionValue(nn.Module):
-    """The value of an action: the first critic's.
+    """The first critic's value of an action, in one network of encoder and critic.
 
     Args:
         encoder: from the observation to features [..., F].
@@ -118,7 +118,7 @@ class ActionValue(nn.Module):
 
 
 class StateValue(nn.Module):
-    """The value of a state: the first critic's at the action zero.
+    """The value of a state: the first critic's value of the action zero.
 
     Zero is invariant under rotations, so the value of an equivariant network is invariant.
 

@@ -54,7 +54,7 @@ class ASRState(NamedTuple):
 
 
 class ASR(SpatialQNetwork):
-    """Levels of choices: all pixels, then the values of one component at the chosen pixel each.
+    """A network that chooses a pixel first, then one more component of the action per level.
 
     All levels share the first level's feature map, so the losses of the later levels also train the
     first level's encoder.

@@ -20,7 +20,7 @@ from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 
 @dataclass(frozen=True)
 class SpatialSpec:
-    """Images and actions that a spatial Q network is built for.
+    """What a spatial Q network is built for: images, action and workspace.
 
     Args:
         images: declarations of the network's input images, by key, in the order of its arguments:
@@ -75,10 +75,11 @@ class Level(NamedTuple):
 
 
 class SpatialQNetwork(nn.Module, ABC):
-    """Q values of an action that is chosen level by level, each given the choices before it.
+    """Base of open-loop networks, which choose an action level by level.
 
-    The primitive is not chosen: an empty gripper picks, a gripper that holds an object places. The
-    values belong to this primitive.
+    The Q values of a level depend on the choices at the levels before. The primitive is not chosen:
+    an empty gripper picks, a gripper that holds an object places. The values belong to this
+    primitive.
     """
 
     levels: tuple[Level, ...]

@@ -22,7 +22,7 @@ _DEFAULT_GROUP_ORDER = 4
 
 
 class FCN(SpatialQNetwork):
-    """One level of choices: all pixels, or all pairs of a yaw and a pixel.
+    """A network with one value for each pixel, or for each pair of a yaw and a pixel.
 
     Args:
         values: (heightmap, in_hand, holding) -> (values [B, maps, H, W], bottleneck map).

@@ -22,7 +22,7 @@ OBJECT_HEIGHT_M = 0.01
 
 
 class SpatialActions:
-    """The bijection between the levels' indices and the actions on their grid.
+    """Converts between a spatial network's choices and the actions on its grid.
 
     Indices of x and y are rows and columns of the heightmap. The action is the centre of the pixel.
 
@@ -97,7 +97,7 @@ class SpatialActions:
         return torch.stack(columns, dim=-1)
 
     def swaps_fingers(self, action: Tensor) -> Tensor:
-        """Return whether the nearest indices swap the fingers, bool [...], of actions [..., A]."""
+        """Return whether the choices nearest to actions [..., A] swap the fingers, bool [...]."""
         if "rz" not in self.components or not self.actions.half_rotation:
             return torch.zeros(action.shape[:-1], dtype=torch.bool, device=action.device)
         rz = self.components.index("rz")
@@ -219,7 +219,7 @@ class SpatialValues(nn.Module):
         return found
 
     def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
-        """Return the values of every level, and which choices belong to one of several actions.
+        """Return the values of every level, and which choices lead to any of several actions.
 
         The values of a level, and the actions that count there, are those after the choice of the
         greatest value among the actions at each level before.
@@ -309,5 +309,5 @@ class SpatialPolicy(nn.Module):
 
 
 def spatial_policy(policy: SpatialPolicy) -> TensorDictModule:
-    """Return the policy as a TensorDict module, from the observation to ``action``."""
+    """Return a spatial policy as a TensorDict module, from the observation to ``action``."""
     return TensorDictModule(policy, in_keys=policy.values.in_keys, out_keys=[keys.ACTION])

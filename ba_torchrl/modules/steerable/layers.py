@@ -170,7 +170,7 @@ class SteerableConv2d(nn.Module):
         return kernels.permute(0, 2, 3, 4, 1, 5).reshape(out_count * out_size, k, k, -1)
 
     def filters(self, dtype: torch.dtype) -> tuple[Tensor, Tensor | None]:
-        """As `expand`, but from `reuse_filters` where it applies."""
+        """Return the result of `expand`, which `reuse_filters` keeps for further calls."""
         if torch.is_grad_enabled() or torch.compiler.is_compiling():
             return self.expand(dtype)
         kept = _expanded.get()
@@ -226,7 +226,7 @@ class SteerableConv2d(nn.Module):
 
 
 class SteerableLinear(SteerableConv2d):
-    """The steerable map between vectors of fields: a one-pixel `SteerableConv2d`."""
+    """An equivariant linear layer between vectors of fields: a one-pixel `SteerableConv2d`."""
 
     def __init__(self, in_types: FieldTypes, out_types: FieldTypes) -> None:
         super().__init__(in_types, out_types, 1)

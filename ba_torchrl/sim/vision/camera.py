@@ -72,7 +72,7 @@ class Camera:
 
 
 def perspective(lens: Lens, pixels: int, range_m: Range, values: Values = "depth") -> Camera:
-    """Return the geometry of an image of a lens."""
+    """Return the geometry of a perspective image."""
     focal, center = lens.focal_px(pixels), (pixels - 1) / 2
     intrinsics = np.array([[focal, 0.0, center], [0.0, focal, center], [0.0, 0.0, 1.0]])
     down, right, forward = lens.axes
@@ -88,7 +88,7 @@ def orthographic(
     values: Values,
     yaw_rad: float = 0.0,
 ) -> Camera:
-    """Return the geometry of an image of a square, from straight above.
+    """Return the geometry of an orthographic image of a square, seen from above.
 
     Args:
         center_m: position of the camera, of depth 0.

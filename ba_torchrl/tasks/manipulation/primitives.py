@@ -61,7 +61,7 @@ def nearest_equivalent_yaw(
 
 
 def grasped_body(robot: Robot) -> Body | None:
-    """Return the body between fingers that press on it, None without one.
+    """Return the body on which both fingers press; None without such a body.
 
     Open fingers can touch a wide body on both sides, too, but do not press on it.
     """

@@ -37,7 +37,7 @@ def share(value: float, start: float, end: float) -> float:
 
 
 def turn_m(robot: Robot, yaws_rad: Iterable[float]) -> float:
-    """Return the least yaw error of the gripper in metres, see `TURN_M`.
+    """Return the gripper's smallest yaw error, turned into metres by `TURN_M`.
 
     Args:
         yaws_rad: yaws of the gripper; one suffices, and half a turn makes no difference.

@@ -117,7 +117,7 @@ class Blueprint:
                 raise ValueError(f"slot {number}: its two supports must rest on the same slots")
 
     def bridge_on(self, number: int) -> tuple[Slot | None, int | None]:
-        """Return the bridge that a slot supports, and the number of its other support.
+        """Return the bridge on a slot, and the slot number of the bridge's other support.
 
         Both are None if the slot supports no bridge.
         """
@@ -128,7 +128,7 @@ class Blueprint:
 
 
 def tower(*pieces: Piece) -> Blueprint:
-    """Return a stack of pieces, the lowest first; nothing may rest on the last one."""
+    """Return a stack of pieces, the lowest first; nothing may rest on the last piece."""
     return Blueprint(
         tuple(
             Slot(piece, on=(i - 1,) if i else (), stays_clear=i == len(pieces) - 1)
