@@ -45,7 +45,7 @@ class LevelValues(Protocol):
         ...
 
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the greedy choices [B, n], level after level, and the last level's value [B, 1]."""
+        """Return the greedy choices [B, n], level by level, and the last level's value [B, 1]."""
         ...
 
     def value_of(self, *observation_and_choices: Tensor) -> Tensor:
