@@ -12,7 +12,7 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.gym import GymEnv, Observation
 from ba_torchrl.envs.observations import vector_names
-from ba_torchrl.tasks.goals import GOALS
+from ba_torchrl.tasks.base import TASKS
 
 _GOALS = ("achieved_goal", "desired_goal")
 
@@ -25,7 +25,7 @@ class GoalEnv(GymEnv):
     scene achieve nothing: both goals then stay as they were in the step before.
 
     Args:
-        task: one of `ba_torchrl.tasks.goals.GOALS`.
+        task: with `Task.goal_vectors`.
         config: as of `GymEnv`, with ``obs_type="vec"`` and sparse rewards.
 
     Raises:
@@ -33,8 +33,10 @@ class GoalEnv(GymEnv):
     """
 
     def __init__(self, task: str, *args: Any, **config: Any) -> None:
-        if task not in GOALS:
-            raise ConfigError(f"{task} has no goals as vectors. Known: {', '.join(GOALS)}")
+        vectors = TASKS[task].goal_vectors
+        if vectors is None:
+            known = (name for name in TASKS if TASKS[name].goal_vectors is not None)
+            raise ConfigError(f"{task} has no goals as vectors. Known: {', '.join(known)}")
         for field, needed in (("obs_type", "vec"), ("reward", "sparse")):
             if config.get(field, needed) != needed:
                 raise ConfigError(
@@ -42,7 +44,7 @@ class GoalEnv(GymEnv):
                     "out"
                 )
         super().__init__(task, *args, **config)
-        self._goal = GOALS[task]
+        self._goal = vectors
         poses = self._entries[keys.OBSERVATION]
         goals = tuple(f"object_{place}_" for place in self._goal.landmarks)
         names = vector_names(poses.shape[0] // 4 - 1)

@@ -45,13 +45,13 @@ VARIANTS = {
 def variants_of(task: str) -> dict[str, Variant]:
     """Return the `VARIANTS` of a registered task.
 
-    Without `progress` it has no dense rewards, without an entry in `GOALS` no goals.
+    Without `progress` it has no dense rewards, without `goal_vectors` no goals.
     """
     from ba_torchrl.tasks.base import TASKS, Task
-    from ba_torchrl.tasks.goals import GOALS
 
-    missing = {"StateDense"} if TASKS.entry(task).progress is Task.progress else set()
-    missing |= set() if task in GOALS else {"Goal"}
+    entry = TASKS.entry(task)
+    missing = {"StateDense"} if entry.progress is Task.progress else set()
+    missing |= {"Goal"} if entry.goal_vectors is None else set()
     return {name: variant for name, variant in VARIANTS.items() if name not in missing}
 
 

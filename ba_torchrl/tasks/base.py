@@ -22,6 +22,7 @@ from ba_torchrl.sim.geometry import Matrix, YawPose
 from ba_torchrl.sim.robots.base import Robot
 from ba_torchrl.sim.shapes import Box, Color
 from ba_torchrl.sim.world import World
+from ba_torchrl.tasks.goals import Goal
 from ba_torchrl.tasks.terrain.flat import Flat, Terrain
 from ba_torchrl.tasks.workspace import ActionLimits, Workspace
 
@@ -106,6 +107,9 @@ class Task(ABC):
     """Whether an episode that reaches the step limit is terminated instead of truncated."""
     fits_tray: ClassVar[bool] = False
     """Whether the objects fit the tray of `close_loop_tray`."""
+    goal_vectors: ClassVar[Goal | None] = None
+    """Success as a comparison of two vectors, for the task's ``-Goal`` id; None without such an
+    id."""
     equal_moves: ClassVar[int] = 0
     """Open loop: largest number of commands of `expert_moves`; 0 if the expert gives its own
     alone."""

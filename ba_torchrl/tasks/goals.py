@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-
-from ba_torchrl.tasks.base import Task
 
 
 @dataclass(frozen=True)
@@ -26,40 +25,13 @@ class Goal:
     """
 
     names: tuple[str, ...]
-    achieved: Callable[[Task], Sequence[float]]
-    desired: Callable[[Task], Sequence[float]]
+    achieved: Callable[[Any], Sequence[float]]
+    desired: Callable[[Any], Sequence[float]]
     radius: str | None = None
     landmarks: tuple[int, ...] = ()
 
-    def is_reached(self, task: type[Task], achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
+    def is_reached(self, task: type, achieved: np.ndarray, desired: np.ndarray) -> np.ndarray:
         """Return whether goals [..., n] are reached, [...] bool."""
         if self.radius is None:
             return (achieved >= desired).all(-1)
         return np.linalg.norm(achieved - desired, axis=-1) < getattr(task, self.radius)
-
-
-GOALS: dict[str, Goal] = {
-    "close_loop/block_reaching": Goal(
-        names=("tool x", "tool y", "tool z"),
-        achieved=lambda task: task.robot.tool_pose()[0],
-        desired=lambda task: task.block.position,
-        radius="goal_distance_m",
-        landmarks=(0,),
-    ),
-    "close_loop/block_pushing": Goal(
-        names=("block x", "block y"),
-        achieved=lambda task: task.block.position[:2],
-        desired=lambda task: task.goal.position[:2],
-        radius="goal_radius_m",
-        landmarks=(1,),
-    ),
-    "close_loop/block_picking": Goal(
-        names=("block is grasped", "tool z"),
-        achieved=lambda task: (
-            task.robot.held_body() is task.block,
-            task.robot.tool_pose()[0][2],
-        ),
-        desired=lambda task: (1.0, task.lift_height_m),
-    ),
-}
-"""By task. A module with a task of its own adds its goal before it registers the task."""

@@ -11,7 +11,6 @@ import pytest
 import ba_torchrl
 from ba_torchrl.envs.registration import gym_id, register_tasks
 from ba_torchrl.tasks.base import TASKS, Task
-from ba_torchrl.tasks.goals import GOALS
 
 BUILT_IN = [task for task in TASKS if TASKS.plugin_module(task) is None]
 PICKING = "BulletArm/CloseLoopBlockPicking-v0"
@@ -38,7 +37,7 @@ def ids(task):
     """The ids of a task: images, states, and states with dense rewards and goals if it has them."""
     kinds = ["", "State"]
     kinds += ["StateDense"] if TASKS[task].progress is not Task.progress else []
-    kinds += ["Goal"] if task in GOALS else []
+    kinds += ["Goal"] if TASKS[task].goal_vectors is not None else []
     return [gym_id(task, kind) for kind in kinds]
 
 

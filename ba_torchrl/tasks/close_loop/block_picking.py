@@ -11,6 +11,7 @@ import numpy as np
 from ba_torchrl.core.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.goals import Goal
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import grasp, grasped_body, lift
 from ba_torchrl.tasks.manipulation.progress_terms import lift_height, reach, staged
@@ -28,6 +29,14 @@ class BlockPicking(CloseLoopTask):
     fits_tray = True
     lift_height_m: ClassVar[float] = 0.15
     """Least height of the tool at success, metres."""
+    goal_vectors = Goal(
+        names=("block is grasped", "tool z"),
+        achieved=lambda task: (
+            task.robot.held_body() is task.block,
+            task.robot.tool_pose()[0][2],
+        ),
+        desired=lambda task: (1.0, task.lift_height_m),
+    )
 
     def load_scene(self) -> None:
         """Load the block."""

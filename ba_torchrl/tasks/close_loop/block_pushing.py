@@ -13,6 +13,7 @@ from ba_torchrl.sim.bodies import Body
 from ba_torchrl.sim.geometry import YawPose
 from ba_torchrl.sim.shapes import Decal
 from ba_torchrl.tasks.base import BLOCK_M, GREEN, TASKS, CloseLoopTask
+from ba_torchrl.tasks.goals import Goal
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.progress_terms import nearness, staged
 from ba_torchrl.tasks.manipulation.pushing import Push, reach_behind
@@ -34,6 +35,13 @@ class BlockPushing(CloseLoopTask):
     """Largest distance between the centres of block and goal area at success, metres."""
     least_distance_m: ClassVar[float] = 0.09
     """Least distance between the centres of block and goal area at the start, metres."""
+    goal_vectors = Goal(
+        names=("block x", "block y"),
+        achieved=lambda task: task.block.position[:2],
+        desired=lambda task: task.goal.position[:2],
+        radius="goal_radius_m",
+        landmarks=(1,),
+    )
 
     def load_scene(self) -> None:
         """Load the block and the goal area."""

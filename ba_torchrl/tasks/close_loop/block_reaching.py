@@ -11,6 +11,7 @@ import numpy as np
 from ba_torchrl.core.actions import GripperCommand
 from ba_torchrl.sim.bodies import Body
 from ba_torchrl.tasks.base import TASKS, CloseLoopTask
+from ba_torchrl.tasks.goals import Goal
 from ba_torchrl.tasks.instructions import colored
 from ba_torchrl.tasks.manipulation.primitives import OPEN, grasp
 from ba_torchrl.tasks.manipulation.progress_terms import reach, staged
@@ -28,6 +29,13 @@ class BlockReaching(CloseLoopTask):
     fits_tray = True
     goal_distance_m: ClassVar[float] = 0.03
     """Largest distance between tool point and centre of the block at success, metres."""
+    goal_vectors = Goal(
+        names=("tool x", "tool y", "tool z"),
+        achieved=lambda task: task.robot.tool_pose()[0],
+        desired=lambda task: task.block.position,
+        radius="goal_distance_m",
+        landmarks=(0,),
+    )
 
     def load_scene(self) -> None:
         """Load the block."""
