@@ -58,6 +58,7 @@ def main(settings: Settings) -> None:
     page = write_report(found, unfinished, folder, settings.axis)
     print((folder / "table.md").read_text(encoding="utf-8"))
     print(f"  page    {page}")
+    print(f"  figures {folder / '*.pdf'}, the same as .svg")
     tables = "table.md, comparisons.csv; by seed seeds.csv, curves.csv"
     print(f"  tables  {folder / 'table.csv'}, {tables}")
 

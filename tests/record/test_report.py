@@ -670,6 +670,7 @@ def test_the_command_reports_several_folders(tmp_path, capsys):
     out = capsys.readouterr().out
     assert "## one" in out
     assert f"{tmp_path}/out/report.html" in out
+    assert f"{tmp_path}/out/*.pdf" in out
     assert "updates" in texts(tmp_path / "out/one.svg")
     names = {path.name for path in (tmp_path / "out").iterdir()}
     tables = {"table.csv", "table.md"}
