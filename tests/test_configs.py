@@ -66,6 +66,14 @@ def test_a_network_of_the_other_control_is_refused(task, algorithm, network):
         experiment("train", f"task={task}", f"algorithm={algorithm}", f"network={network}")
 
 
+@pytest.mark.parametrize("name", registries.NETWORKS)
+def test_the_sizes_of_a_network_are_bounded(name):
+    """A policy in a file has the settings that somebody else wrote."""
+    for field, info in registries.NETWORKS[name].model_fields.items():
+        if info.annotation in (int, int | None) or field.endswith("width"):
+            assert any(hasattr(bound, "le") for bound in info.metadata), field
+
+
 @pytest.mark.parametrize("network", NETWORKS)
 def test_every_network_composes(network):
     control = presets("network")[network]["name"]

@@ -30,16 +30,16 @@ class FlowConfig(LearnerConfig):
     rotation: Annotated[NoRotation | Sampled, Field(discriminator="name")] = NoRotation()
     """Of sampled transitions and their chunks about the z axis."""
     replay: Uniform = Uniform()
-    horizon: int = Field(default=4, ge=1)
+    horizon: int = Field(default=4, ge=1, le=100)
     """Number of actions in a chunk."""
     executed: int = Field(default=2, ge=1)
     """Number of a chunk's first actions that are executed before the policy draws the next
     chunk."""
-    steps: int = Field(default=8, ge=1)
+    steps: int = Field(default=8, ge=1, le=1000)
     """Steps of Euler's method from noise to a chunk."""
-    draws: int = Field(default=4, ge=1)
+    draws: int = Field(default=4, ge=1, le=1000)
     """Noises and times per chunk in an update, for which an image is encoded once."""
-    hidden: int = Field(default=256, ge=1)
+    hidden: int = Field(default=256, ge=1, le=4096)
     """Units of both hidden layers of the head."""
 
     @model_validator(mode="after")

@@ -28,11 +28,11 @@ class RLPDConfig(SACConfig):
     """False: the host draws members of the ensemble in each update."""
 
     replay: Symmetric = Symmetric()
-    critics: int = Field(default=10, ge=2)
+    critics: int = Field(default=10, ge=2, le=100)
     """Number of critics in the ensemble."""
     subset: int = Field(default=2, ge=1)
     """Number of target critics, drawn in each update, whose minimum is the target."""
-    critic_updates: int = Field(default=4, ge=1)
+    critic_updates: int = Field(default=4, ge=1, le=1000)
     """Critic updates per update of the policy, each on another batch."""
     entropy_backup: bool = False
     """Whether targets have the entropy term."""

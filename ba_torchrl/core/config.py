@@ -63,6 +63,8 @@ Interval = Annotated[tuple[float, float], BeforeValidator(_pair)]
 
 MAX_ENVS = 1024
 """Largest number of environments of a vector: PyBullet's number of worlds."""
+MAX_PIXELS = 1024
+"""Largest number of rows and columns of an image."""
 Source = Literal["expert", "deconstruction"]
 """How demonstrations are made: by an expert, or by reversing deconstruction episodes."""
 CompileMode = Literal["default", "reduce-overhead", "max-autotune"]

@@ -10,7 +10,7 @@ import numpy as np
 from pydantic import Field, field_validator, model_validator
 from typing_extensions import Self
 
-from ba_torchrl.core.config import Interval, StrictModel, TaskParameters, numbers_of
+from ba_torchrl.core.config import MAX_PIXELS, Interval, StrictModel, TaskParameters, numbers_of
 from ba_torchrl.core.errors import ConfigError
 
 Rgb = tuple[float, float, float]
@@ -37,11 +37,11 @@ class EnvConfig(StrictModel):
     """Ranges of x, y and z."""
     object_scale_range: Interval | None = None
     """Scale of the objects, drawn per episode in steps of 0.02; a number means that scale."""
-    max_steps: int | None = Field(default=None, ge=1)
+    max_steps: int | None = Field(default=None, ge=1, le=1_000_000)
     """Steps until the episode is truncated."""
     num_objects: int | None = Field(default=None, ge=1)
     """Number of objects, for tasks that allow several numbers."""
-    obs_size: int = Field(default=128, ge=16, le=1024)
+    obs_size: int = Field(default=128, ge=16, le=MAX_PIXELS)
     """Pixels along each side of the image."""
     in_hand_size: int | None = Field(default=None, ge=8, le=256, json_schema_extra=_OPEN_LOOP)
     """Open loop: pixels along each side of the in-hand image. By default 24, and 40 on bumps
@@ -82,7 +82,7 @@ class EnvConfig(StrictModel):
     observations: tuple[str, ...] = ()
     """Further observations by their registered names: "proprio", "joints", "wrist_rgb",
     "segmentation", "instruction"; see `ba_torchrl.envs.observations`."""
-    camera_size: int | None = Field(default=None, ge=16, le=1024)
+    camera_size: int | None = Field(default=None, ge=16, le=MAX_PIXELS)
     """Rows and columns of the cameras' images: `rgb`, "wrist_rgb", "segmentation". None stands for
     `obs_size`."""
     floor_color: Rgb | None = None
@@ -93,9 +93,9 @@ class EnvConfig(StrictModel):
     physics_mode: Literal["fast", "slow", "custom"] = "fast"
     """Settings of the physics engine: the fastest that hold grasps reliably, finer ones, or those
     of `time_step_s`, `solver_iterations` and `solver_residual`."""
-    time_step_s: float | None = Field(default=None, gt=0, le=1 / 60)
+    time_step_s: float | None = Field(default=None, ge=1e-4, le=1 / 60)
     """Custom physics: length of a physics step."""
-    solver_iterations: int | None = Field(default=None, ge=1)
+    solver_iterations: int | None = Field(default=None, ge=1, le=10_000)
     """Custom physics: iterations of the contact solver in each step."""
     solver_residual: float | None = Field(default=None, ge=0)
     """Custom physics: residual at which the solver stops early; 0 for all iterations. As for the

@@ -105,6 +105,10 @@ class ResolvedEnv:
         """Return a copy in which some parameters have other values, resolved anew."""
         return resolve_env(self, changes)
 
+    def without_window(self) -> ResolvedEnv:
+        """Return the environment without PyBullet's window, which belongs to a machine."""
+        return self.changed(render=False) if self.config.render else self
+
     def check_spawned_process_knows(self) -> None:
         """Check that a spawned process can import the modules of the environment's parts."""
         for registry, name, module in _plugins(self.task_id, self.config):

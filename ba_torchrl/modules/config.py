@@ -10,6 +10,13 @@ from ba_torchrl.core.choices import Control
 from ba_torchrl.core.config import StrictModel
 from ba_torchrl.core.registry import Registry
 
+MAX_WIDTH = 32
+"""Largest factor on the width of layers."""
+MAX_DIHEDRAL = 16
+"""Most rotations of a group with reflections; its kernels take ten seconds of a CPU to compute."""
+MAX_EQUIVARIANT_YAWS = 32
+"""Most yaws of an equivariant network, whose group has up to twice as many elements."""
+
 
 class NetworkConfig(StrictModel):
     """A registered network: its hyper-parameters, and how it is built.

@@ -386,7 +386,8 @@ def load(
     """
     checkpoint = find_checkpoint(path, which)
     config = read_config(checkpoint.parent.parent, **changes)
-    learner = build_to_load(config)
+    size = sum(file.stat().st_size for file in checkpoint.rglob("*"))
+    learner = build_to_load(config, checkpoint, size)
     DurableCheckpoint(algorithm=learner).load(checkpoint)
     return config, learner
 

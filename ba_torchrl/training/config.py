@@ -166,8 +166,8 @@ class ExperimentConfig(WorkerOptions):
 
     def resolved(self) -> dict[str, Any]:
         """Return what determines the run as JSON: every default of the task filled in, without the
-        resources of the collector."""
-        values, unset = self.model_dump(mode="json"), set(SET_BY_THE_EXPERIMENT)
+        resources of the collector and the window."""
+        values, unset = self.model_dump(mode="json"), {*SET_BY_THE_EXPERIMENT, "render"}
         for name in self.collector.resources:
             values["collector"].pop(name, None)
         return {**values, "env": self.env.config.model_dump(mode="json", exclude=unset)}

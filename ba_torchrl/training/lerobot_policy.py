@@ -94,7 +94,7 @@ class LeRobotPolicy(EnvPolicy):
         self.policy = policy.requires_grad_(False)
         self._before, self._after = before, after
         self.trained, self.source, self.updates = trained, source, trained.updates
-        self.resolved_env, self.result = trained.resolved_env, None
+        self.resolved_env, self.result = trained.resolved_env.without_window(), None
         with closing(make(self.resolved_env)) as env:
             self.view = PolicyView(env, trained.observed, trained.cameras)
             specs = env.observation_spec

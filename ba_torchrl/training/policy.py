@@ -34,6 +34,7 @@ from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.record.results import (
+    NON_LEARNING_FIELDS,
     POLICY_RESULT,
     POLICY_SUFFIX,
     RESULT_FILE,
@@ -62,6 +63,8 @@ _OF_TRAINING = {
     "demonstrations_mapping": None,
 }
 """Fields of a run that its policy does not need, with values that need no package or file."""
+_OF_POLICY = {"plugins", "label", "benchmark"}
+"""Fields that do not affect learning and belong to a policy, not to the machine of its training."""
 _COUNTS = ("demonstrations", "demonstration_steps", "env_steps", "expert_labels", "seconds")
 """Entries of a run's result that the result of its policy has."""
 _OF_IMAGES = ("workspace", "in_hand_mode", "view_type", "view_scale")
@@ -203,7 +206,7 @@ class TrainedPolicy(EnvPolicy):
         vectors = {key: (length,) for key, length in learner.vectors.items()}
         known = {**images, **vectors, keys.HOLDING: (1,)}
         self.shapes = {key: known[key] for key in self.in_keys if key in known}
-        self.resolved_env = config.env
+        self.resolved_env = config.env.without_window()
         self.config, self.updates, self.source = config, updates, source
         self.versions, self.result = versions, result
         self.eval()
@@ -290,7 +293,7 @@ def load_policy(
         raise DamagedFilesError(f"{path} was altered: it does not have the weights of its result")
     changes = {"run_dir": str(path.parent), "resume": False, **changes}
     config = parse_saved(known.config, path, **changes)
-    learner = build_to_load(config)
+    learner = build_to_load(config, path, len(data))
     try:
         learner.policy.load_state_dict(load_tensors(data))
     except (RuntimeError, SafetensorError) as error:
@@ -386,9 +389,10 @@ def _result(policy: TrainedPolicy, test: PolicyTest, digest: str) -> RunResult:
     if policy.source.is_dir() and (run / RESULT_FILE).exists():
         known = read_result(run)
         trained_on = Machine(hardware=known.hardware, versions=known.versions)
-    settings = config.resolved()
-    for name in ("run_dir", "resume", "device"):
-        del settings[name]
+    of_machine = NON_LEARNING_FIELDS - _OF_POLICY
+    settings = {name: value for name, value in config.resolved().items() if name not in of_machine}
+    for name in ("demonstrations_path", "demonstrations_mapping"):
+        settings[name] = settings[name] and Path(settings[name]).name
     return RunResult(
         protocol=PROTOCOL,
         task=policy.task,

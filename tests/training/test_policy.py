@@ -241,7 +241,66 @@ def test_a_file_acts_like_the_run(run, tmp_path):
         for name in ("env_steps", "demonstrations", "expert_labels", "expert_version", "seconds"):
             assert getattr(found, name) == getattr(trained, name), name
     assert again.env_config == policy.env_config
-    assert str(run).encode() not in path.read_bytes()
+
+
+def test_a_policy_has_nothing_of_the_machine_of_its_training(run, tmp_path, monkeypatch):
+    saved = json.loads((run / "config.json").read_text())
+    own = {"threads": 1, "timeout_s": 9, "video_episodes": 7}
+    env = {**saved["env"], "render": True}
+    paths = {"demonstrations_path": str(tmp_path / "demos"), "demonstrations_mapping": "/m/a.yaml"}
+    copy, path = tmp_path / "run", tmp_path / "p.safetensors"
+    shutil.copytree(run, copy)
+    (copy / "config.json").write_text(json.dumps({**saved, **own, "env": env}))
+    monkeypatch.delenv("DISPLAY", raising=False)  # a window would be refused
+    policy = ba_torchrl.load_policy(copy)
+    assert "render" not in policy.env_config
+    policy.config = policy.config.model_copy(update=paths)
+    result = policies.save_policy(policy, path, with_outcomes(1))
+    assert str(tmp_path).encode() not in path.read_bytes()
+    gone = {*own, "device", "parallel", "run_dir", "resume", "start_method", "logger"}
+    assert not result.config.keys() & gone
+    assert "render" not in result.config["env"]
+    assert {name: result.config[name] for name in paths} == {
+        "demonstrations_path": "demos",
+        "demonstrations_mapping": "a.yaml",
+    }
+    result.config["env"]["render"] = True  # as an earlier version wrote it
+    path.write_bytes(save(load(path.read_bytes()), {"result": result.model_dump_json()}))
+    observed(ba_torchrl.load_policy(path))
+
+
+def test_a_checkpoint_that_is_much_smaller_than_its_networks_is_refused(run, tmp_path):
+    shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    saved = json.loads((run / "config.json").read_text())
+    saved["network"]["width"] = 32.0
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    with pytest.raises(ConfigError, match=r"/checkpoint-\d+ does not hold the weights of its set"):
+        ba_torchrl.load_policy(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"network": {"group_order": 100_000}}, "group_order: Input should be less than or equal"),
+        ({"network": {"n_hidden": 10**9}}, "n_hidden: Input should be less than or equal"),
+        ({"network": {"group_order": 32, "reflections": True}}, "group_order is at most 16 with"),
+        (
+            {"network": {"group_order": 32, "reflections": False, "n_hidden": 1024}},
+            r"does not hold the weights of its settings, .* more than [\d,]+ parameters",
+        ),
+        ({"env": {"obs_size": 10**6}}, "obs_size: Input should be less than or equal"),
+        ({"env": {"max_steps": 10**30}}, "max_steps: Input should be less than or equal"),
+        ({"algorithm": {"replay": {"name": "prioritized", "capacity": 10**12}}}, "capacity: Input"),
+    ],
+)
+def test_absurd_sizes_in_a_file_are_refused_before_a_network_is_built(tmp_path, changes, message):
+    whole = policies.shipped_file("close_loop/block_picking").read_bytes()
+    path, saved = tmp_path / "p.safetensors", json.loads(header_texts(Path(), whole)["result"])
+    for name, values in changes.items():
+        saved["config"][name] |= values
+    path.write_bytes(save(load(whole), {"result": json.dumps(saved)}))
+    with pytest.raises(ConfigError, match=rf"(?s){path}.*{message}"):
+        ba_torchrl.load_policy(path)
 
 
 def test_what_is_no_policy_is_named(run, tmp_path):

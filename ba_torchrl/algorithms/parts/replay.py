@@ -21,7 +21,7 @@ class _Replay(Part):
     least_batch: ClassVar[int] = 1
     """Least number of transitions in a batch."""
 
-    capacity: int = Field(default=100_000, ge=1)
+    capacity: int = Field(default=100_000, ge=1, le=100_000_000)
     """Transitions, demonstrations and others together."""
 
     @property

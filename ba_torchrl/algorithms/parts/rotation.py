@@ -49,7 +49,7 @@ class Stored(Part):
     """Rotated copies that are stored with each transition, as in the reference implementation."""
 
     name: Literal["stored"] = "stored"
-    copies: int = Field(default=4, ge=1)
+    copies: int = Field(default=4, ge=1, le=100)
     """Number of copies of each transition; reference implementation."""
 
     def build(self, *args: Any) -> list[Transform]:
@@ -117,7 +117,7 @@ class Cn(Rigid):
     """Turns of the cyclic group of sampled open-loop transitions."""
 
     name: Literal["cn"] = "cn"
-    order: int = Field(default=16, ge=1)
+    order: int = Field(default=16, ge=1, le=360)
     """Number of turns."""
 
 

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from ba_torchrl.core.config import Part
+from ba_torchrl.core.config import MAX_PIXELS, Part
 
 if TYPE_CHECKING:
     from torchrl.envs import Transform
@@ -39,9 +39,9 @@ class NoViews(_Whole):
 
 
 class _Random(_Whole):
-    views: int = Field(default=1, ge=1)
+    views: int = Field(default=1, ge=1, le=100)
     """Views of each observation, over which the losses are averaged."""
-    target_views: int = Field(default=1, ge=1)
+    target_views: int = Field(default=1, ge=1, le=100)
     """Views of each next observation, over which the target is averaged."""
 
     @property
@@ -60,7 +60,7 @@ class Crop(_Random):
     """A part of the image; acting takes its centre."""
 
     name: Literal["crop"] = "crop"
-    size: int = Field(default=128, ge=1)
+    size: int = Field(default=128, ge=1, le=MAX_PIXELS)
     """Rows and columns, pixels."""
 
     def seen(self, images: Mapping[str, ImageSpec]) -> dict[str, ImageSpec]:
@@ -84,7 +84,7 @@ class Shift(_Random):
     """The image moved by some pixels, with its border repeated."""
 
     name: Literal["shift"] = "shift"
-    pixels: int = Field(default=4, ge=1)
+    pixels: int = Field(default=4, ge=1, le=MAX_PIXELS)
     """Largest shift; that of Kostrikov et al. (2021)."""
 
     def build(self, *args: Any, **options: Any) -> list[Transform]:

@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
-from ba_torchrl.modules.config import NETWORKS
+from ba_torchrl.modules.config import MAX_WIDTH, NETWORKS
 
 
 @NETWORKS.register("cnn")
@@ -20,4 +20,4 @@ class CNNConfig(ImageNetworkConfig):
 
     builder: ClassVar[str] = "ba_torchrl.modules.actor_critic.cnn:build_cnn"
 
-    width: float = Field(default=1.0, gt=0)
+    width: float = Field(default=1.0, gt=0, le=MAX_WIDTH)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from pydantic import Field
+from pydantic import Field, model_validator
+from typing_extensions import Self
 
 from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
-from ba_torchrl.modules.config import NETWORKS
+from ba_torchrl.modules.config import MAX_DIHEDRAL, NETWORKS
 
 
 @NETWORKS.register("equi")
@@ -28,9 +29,15 @@ class EquivariantConfig(ImageNetworkConfig):
     is_strided: ClassVar[bool] = False
     """Whether strides take the place of max pools."""
 
-    group_order: int = Field(default=8, ge=2)
+    group_order: int = Field(default=8, ge=2, le=32)
     reflections: bool = False
-    n_hidden: int = Field(default=64, ge=4)
+    n_hidden: int = Field(default=64, ge=4, le=1024)
+
+    @model_validator(mode="after")
+    def _check_reflections(self) -> Self:
+        if self.reflections and self.group_order > MAX_DIHEDRAL:
+            raise ValueError(f"group_order is at most {MAX_DIHEDRAL} with reflections")
+        return self
 
 
 @NETWORKS.register("equi_strided")

@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
-from ba_torchrl.modules.config import NETWORKS
+from ba_torchrl.modules.config import MAX_WIDTH, NETWORKS
 
 
 @NETWORKS.register("ferm")
@@ -26,5 +26,5 @@ class FERMConfig(ImageNetworkConfig):
     builder: ClassVar[str] = "ba_torchrl.modules.actor_critic.ferm:build_ferm"
 
     shares_encoder: ClassVar[bool] = True
-    width: float = Field(default=1.0, gt=0)
-    features: int = Field(default=50, ge=1)
+    width: float = Field(default=1.0, gt=0, le=MAX_WIDTH)
+    features: int = Field(default=50, ge=1, le=4096)

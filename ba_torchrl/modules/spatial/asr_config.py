@@ -6,6 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
+from ba_torchrl.core.config import MAX_PIXELS
 from ba_torchrl.modules.config import NETWORKS
 from ba_torchrl.modules.spatial.pose_grid_config import PoseGridConfig
 from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
@@ -21,8 +22,8 @@ class ASRNetworkConfig(SpatialImageConfig):
             differ, the in-hand image is cropped or zero-padded to the patch size about its centre.
     """
 
-    num_rotations: int = Field(default=16, ge=2)
-    patch_size: int | None = Field(default=None, ge=1)
+    num_rotations: int = Field(default=16, ge=2, le=360)
+    patch_size: int | None = Field(default=None, ge=1, le=MAX_PIXELS)
 
 
 @NETWORKS.register("asr")

@@ -6,7 +6,7 @@ from typing import ClassVar, Literal
 
 from pydantic import Field
 
-from ba_torchrl.modules.config import NETWORKS
+from ba_torchrl.modules.config import MAX_DIHEDRAL, MAX_EQUIVARIANT_YAWS, NETWORKS
 from ba_torchrl.modules.spatial.asr_config import ASRNetworkConfig
 
 
@@ -28,5 +28,6 @@ class EquiASRConfig(ASRNetworkConfig):
 
     builder: ClassVar[str] = "ba_torchrl.modules.spatial.equi_asr:build_equi_asr"
 
-    group_order: int = Field(default=4, ge=2)
+    num_rotations: int = Field(default=16, ge=2, le=MAX_EQUIVARIANT_YAWS)
+    group_order: int = Field(default=4, ge=2, le=MAX_DIHEDRAL)
     scene_head: Literal["pool", "flatten"] = "pool"

@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from ba_torchrl.modules.config import NETWORKS
+from ba_torchrl.modules.config import MAX_DIHEDRAL, MAX_EQUIVARIANT_YAWS, NETWORKS
 from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
 
 
@@ -21,7 +21,7 @@ class FCNConfig(SpatialImageConfig):
 
     builder: ClassVar[str] = "ba_torchrl.modules.spatial.fcn:build_fcn"
 
-    num_rotations: int = Field(default=16, ge=2)
+    num_rotations: int = Field(default=16, ge=2, le=360)
 
 
 @NETWORKS.register("equi_fcn")
@@ -41,5 +41,5 @@ class EquiFCNConfig(SpatialImageConfig):
 
     builder: ClassVar[str] = "ba_torchrl.modules.spatial.fcn:build_equi_fcn"
 
-    num_rotations: int = Field(default=16, ge=2)
-    group_order: int | None = Field(default=None, ge=2)
+    num_rotations: int = Field(default=16, ge=2, le=MAX_EQUIVARIANT_YAWS)
+    group_order: int | None = Field(default=None, ge=2, le=MAX_DIHEDRAL)

@@ -21,10 +21,10 @@ class PoseGridConfig(StrictModel):
         max_tilt_rad: greatest tilt; the least is its negative.
     """
 
-    num_z: int = Field(default=36, ge=2)
+    num_z: int = Field(default=36, ge=2, le=1000)
     min_z_m: float = 0.02
     max_z_m: float = 0.20
-    num_tilts: int = Field(default=7, ge=2)
+    num_tilts: int = Field(default=7, ge=2, le=100)
     max_tilt_rad: float = Field(default=math.pi / 8, gt=0)
 
     @property

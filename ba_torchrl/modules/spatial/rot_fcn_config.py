@@ -20,4 +20,4 @@ class RotFCNConfig(SpatialImageConfig):
 
     builder: ClassVar[str] = "ba_torchrl.modules.spatial.rot_fcn:build_rot_fcn"
 
-    num_rotations: int = Field(default=16, ge=2)
+    num_rotations: int = Field(default=16, ge=2, le=360)

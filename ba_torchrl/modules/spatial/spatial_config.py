@@ -9,7 +9,7 @@ from typing_extensions import Self
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.choices import Control, Precision
-from ba_torchrl.modules.config import NetworkConfig
+from ba_torchrl.modules.config import MAX_WIDTH, NetworkConfig
 
 
 class SpatialImageConfig(NetworkConfig):
@@ -36,8 +36,8 @@ class SpatialImageConfig(NetworkConfig):
     precision: Precision = "auto"
     height_scale_m: float = Field(default=1.0, gt=0)
     voxel_scale: float = Field(default=1.0, gt=0)
-    width: float = Field(default=1.0, gt=0)
-    dense_width: float | None = Field(default=None, gt=0)
+    width: float = Field(default=1.0, gt=0, le=MAX_WIDTH)
+    dense_width: float | None = Field(default=None, gt=0, le=MAX_WIDTH)
 
     def in_voxels(self, pixel_m: float) -> Self:
         """Return a copy that scales heights like projections, whose voxels have the edge
