@@ -43,7 +43,10 @@ class LeRobot(Format):
     has_pictures = True
     package = "lerobot"
     tag = "LeRobot"
-    hint = ". LeRobot needs Python 3.12 or later"
+    hint = (
+        ". LeRobot needs Python 3.12 or later, and a torch below 2.12 in the place of a newer one: "
+        "install it in an environment of its own"
+    )
 
     def matches(self, path: Path) -> bool:
         """Return whether it is the folder of a data set."""
