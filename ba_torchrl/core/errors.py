@@ -7,6 +7,7 @@ import errno
 import os
 import re
 import shlex
+import textwrap
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 from typing import Any, get_args
@@ -130,6 +131,11 @@ def install_command(*packages: str) -> str:
         listed = []
     known = {re.split(r"[^\w.-]", line)[0]: line.split(";")[0].strip() for line in listed}
     return shlex.join(["pip", "install", *(known.get(name, name) for name in packages)])
+
+
+def in_one_line(error: Exception) -> str:
+    """Return the type and the text of a library's exception in at most 300 characters."""
+    return textwrap.shorten(f"{type(error).__name__}: {error}", 300)
 
 
 class DamagedFilesError(ConfigError):

@@ -45,7 +45,8 @@ class PolicyView:
         cameras: keys of the images that are pictures; None for the default.
 
     Raises:
-        ConfigError: there is no such image among the observations, or nothing to read.
+        ConfigError: there is no such image among the observations, or the policies read more than
+            is there: a state, and pictures or poses of objects.
     """
 
     def __init__(
@@ -80,8 +81,15 @@ class PolicyView:
             units[STATE].append("1 while none is")
         self.keys = [*felt, *self.images]
         """Keys of the observations that are read."""
-        if not self.keys:
-            raise ConfigError("there is nothing that a policy of LeRobot reads: choose other keys")
+        if not self.names[STATE] or not (self.images or self.names[ENVIRONMENT_STATE]):
+            lacking = (
+                f"a picture or the poses of objects, beside {', '.join(felt)}"
+                if felt
+                else f"a state such as {keys.HOLDING}"
+            )
+            raise ConfigError(
+                f"LeRobot's ACT and Diffusion read {lacking}: choose other keys or cameras"
+            )
         self.units = {part: "; ".join(found) for part, found in units.items()}
         """Their units, in words."""
         letters = {

@@ -34,7 +34,8 @@ class Series(NamedTuple):
 
 def limit_library_logs() -> None:
     """Set the log levels of libraries to warnings."""
-    logging.getLogger("torchrl").setLevel(logging.WARNING)
+    for name in ("torchrl", "lerobot"):
+        logging.getLogger(name).setLevel(logging.WARNING)
 
 
 def progress_bar(**settings: Any) -> tqdm:

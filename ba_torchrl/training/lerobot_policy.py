@@ -18,7 +18,12 @@ from tensordict import TensorDictBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.config import expanded
-from ba_torchrl.core.errors import ConfigError, MissingPackageError, install_command
+from ba_torchrl.core.errors import (
+    ConfigError,
+    MissingPackageError,
+    in_one_line,
+    install_command,
+)
 from ba_torchrl.core.files import json_bytes
 from ba_torchrl.core.hardware import hardware
 from ba_torchrl.demonstrations.formats.base import Card, read_card
@@ -193,8 +198,8 @@ def load_lerobot(folder: str | Path, device: str = "cpu") -> LeRobotPolicy:
         device: where it is computed.
 
     Raises:
-        ConfigError: there is no checkpoint, its data set is not found, or it is of another task or
-            size.
+        ConfigError: there is no checkpoint, LeRobot cannot load it, its data set is not found, or
+            it is of another task or size.
         MissingPackageError: LeRobot is not installed.
     """
     root = Path(expanded(folder))
@@ -211,16 +216,20 @@ def load_lerobot(folder: str | Path, device: str = "cpu") -> LeRobotPolicy:
             f"a policy of LeRobot needs a package that is not installed ({error})",
             install_command("lerobot"),
         ) from error
-    config = configs.PreTrainedConfig.from_pretrained(found)
-    config.device = str(usable_device(device))
-    if hasattr(config, "pretrained_backbone_weights"):
-        config.pretrained_backbone_weights = None  # the checkpoint has them
-    policy = factory.get_policy_class(config.type).from_pretrained(found, config=config)
-    before, after = factory.make_pre_post_processors(
-        config,
-        pretrained_path=str(found),
-        preprocessor_overrides={"device_processor": {"device": config.device}},
-    )
+    place = str(usable_device(device))
+    try:
+        config = configs.PreTrainedConfig.from_pretrained(found)
+        config.device = place
+        if hasattr(config, "pretrained_backbone_weights"):
+            config.pretrained_backbone_weights = None  # the checkpoint has them
+        policy = factory.get_policy_class(config.type).from_pretrained(found, config=config)
+        before, after = factory.make_pre_post_processors(
+            config,
+            pretrained_path=str(found),
+            preprocessor_overrides={"device_processor": {"device": place}},
+        )
+    except Exception as error:  # LeRobot raises anything at files that are damaged
+        raise ConfigError(f"{found}: LeRobot cannot load it: {in_one_line(error)}") from error
     return LeRobotPolicy(policy, before, after, trained, found)
 
 

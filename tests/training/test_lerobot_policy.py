@@ -121,11 +121,20 @@ def checkpoint(tmp_path):
     return tmp_path / "act"
 
 
+def raise_size_mismatch(folder):
+    raise RuntimeError("Errors:\n\tsize mismatch")
+
+
 def test_a_folder_that_is_no_checkpoint_is_one_sentence(checkpoint, monkeypatch):
     with pytest.raises(ConfigError, match=r"no checkpoint of LeRobot at .*nowhere"):
         load_lerobot(checkpoint / "nowhere")
     monkeypatch.setitem(sys.modules, "lerobot.policies.factory", None)
     with pytest.raises(MissingPackageError, match=r"pip install .*lerobot"):
+        load_lerobot(checkpoint)
+    configs = SimpleNamespace(PreTrainedConfig=SimpleNamespace(from_pretrained=raise_size_mismatch))
+    for name, module in (("policies.factory", SimpleNamespace()), ("configs.policies", configs)):
+        monkeypatch.setitem(sys.modules, f"lerobot.{name}", module)
+    with pytest.raises(ConfigError, match=r"model: LeRobot cannot load .*: Errors: size mismatch$"):
         load_lerobot(checkpoint)
     place = checkpoint / "checkpoints/last/pretrained_model"
     trained = lerobot_policy._Training(place)
@@ -184,3 +193,7 @@ def test_stock_policies_train_on_the_export_and_act(kind, settings, tmp_path, mo
     env = acting.make_env(seed=0)
     assert env.rollout(4, acting)["action"].isfinite().all()
     env.close()
+    weights = tmp_path / "out/checkpoints/last/pretrained_model/model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:99])
+    with pytest.raises(ConfigError, match=r"pretrained_model: LeRobot cannot load it: Safetensor"):
+        load_lerobot(tmp_path / "out")

@@ -21,6 +21,7 @@ from ba_torchrl.core.errors import (
     ConfigError,
     DamagedFilesError,
     MissingPackageError,
+    in_one_line,
     install_command,
 )
 from ba_torchrl.core.files import (
@@ -57,7 +58,7 @@ class Rows:
         except ConfigError:
             raise
         except Exception as error:  # libraries raise anything at files that are damaged
-            raise ConfigError(f"cannot be read: {_first_line(error)}") from error
+            raise ConfigError(f"cannot be read: {in_one_line(error)}") from error
 
     def then(self, last: Any) -> Rows:
         """Return these rows and one more, the last one of ``last``."""
@@ -374,7 +375,7 @@ def read_file(form: Format, path: Path) -> list[StoredArrays]:
     except ConfigError:
         raise
     except Exception as error:  # libraries raise anything at files that are not theirs
-        raise ConfigError(f"{path} cannot be read: {_first_line(error)}") from error
+        raise ConfigError(f"{path} cannot be read: {in_one_line(error)}") from error
 
 
 def _with_rows(episodes: Sequence[StoredArrays], beside: Arrays) -> list[StoredArrays]:
@@ -447,10 +448,6 @@ def rows_of(values: Any) -> Rows:
         return values
     array = np.asarray(values)
     return Rows(array.shape, array.dtype, lambda: array)
-
-
-def _first_line(error: Exception) -> str:
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0]}"
 
 
 def card_file(path: Path) -> Path:
