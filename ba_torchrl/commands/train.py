@@ -72,6 +72,7 @@ def main(config: ExperimentConfig) -> None:
             print(f"  {name:<10}  {config.folder / result.files[name]}")
     print(f"  result      {config.folder / RESULT_FILE}")
     print("  to use it in Python:")
+    print(f"    import {', '.join(('ba_torchrl', *config.plugins))}")
     print(f'    policy = ba_torchrl.load_policy({config.run_dir!r}, which="latest")  # or "best"')
     print("    env = policy.make_env()")
     print("    env.rollout(env.max_steps, policy)")

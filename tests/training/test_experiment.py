@@ -447,9 +447,11 @@ def test_the_recipes_from_collection_to_evaluation(tmp_path, capsys):
         "num_envs=2",
         "video_episodes=1",
         f"run_dir={tmp_path}/run",
+        "plugins=[json]",
         config_name="quickstart",
     )
     assert "over 4 episodes" in out
+    assert "    import ba_torchrl, json\n" in out
     assert f"{tmp_path}/run/learning_curve.png" in out
     gif = tmp_path / "film.gif"
     out = printed(
