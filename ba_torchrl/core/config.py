@@ -5,7 +5,7 @@ from __future__ import annotations
 import ast
 import inspect
 import os
-import textwrap
+import sys
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cache
 from itertools import pairwise
@@ -146,20 +146,30 @@ def descriptions(model: type[BaseModel]) -> dict[str, str]:
     return {name: given[name] or found[name] for name in given if given[name] or name in found}
 
 
-@cache
 def _docstrings(model: type[BaseModel]) -> dict[str, str]:
     """Return the docstrings below the fields of a class, not of its bases."""
-    try:
-        body = ast.parse(textwrap.dedent(inspect.getsource(model))).body[0].body
-    except (OSError, TypeError):  # of a class without a file
-        return {}
+    found: Any = _parsed(model.__module__)
+    for name in model.__qualname__.split("."):
+        body = getattr(found, "body", ())
+        classes = (node for node in body if isinstance(node, ast.ClassDef) and node.name == name)
+        found = next(classes, None)
     return {
         field.target.id: inspect.cleandoc(text.value.value)
-        for field, text in pairwise(body)
+        for field, text in pairwise(getattr(found, "body", ()))
         if isinstance(field, ast.AnnAssign)
         and isinstance(text, ast.Expr)
         and isinstance(text.value, ast.Constant)
     }
+
+
+@cache
+def _parsed(module: str) -> ast.Module | None:
+    """Return the source of a module, which `inspect.getsource` would read anew for every class;
+    None of a module without a file."""
+    try:
+        return ast.parse(inspect.getsource(sys.modules[module]))
+    except (OSError, TypeError, KeyError):
+        return None
 
 
 def _plain(value: Any) -> Any:
@@ -330,6 +340,7 @@ class StrictModel(BaseModel):
         frozen=True,
         strict=True,
         allow_inf_nan=False,
+        defer_build=True,  # a command uses few of the models, whose build takes milliseconds each
     )
 
     @model_validator(mode="before")
