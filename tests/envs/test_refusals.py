@@ -32,6 +32,7 @@ def test_render_needs_a_display(make, monkeypatch):
         (PICKING, {"floor_color": (0.1, 0.2)}, "red, green and blue"),
         (PICKING, {"workspace_color": (0.1, 0.2, 2.0)}, "red, green and blue"),
         (PICKING, {"view_type": "from_below"}, "camera_center_xyz"),
+        (PICKING, {"": 1}, "unknown parameter ''"),
         (PICKING, {"drot": math.inf}, "finite"),
         (PICKING, {"dpos": math.nan}, "dpos"),
         (PICKING, {"view_scale": math.inf}, "finite"),

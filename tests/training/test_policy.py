@@ -269,8 +269,9 @@ def test_a_policy_has_nothing_of_the_machine_of_its_training(run, tmp_path, monk
     observed(ba_torchrl.load_policy(path))
 
 
-def test_a_checkpoint_that_is_much_smaller_than_its_networks_is_refused(run, tmp_path):
+def test_a_checkpoint_is_loaded_without_a_replay_and_refused_if_it_is_too_small(run, tmp_path):
     shutil.copytree(run, tmp_path, dirs_exist_ok=True)
+    assert load_checkpoint(tmp_path)[1].replay.storage.max_size == 1
     saved = json.loads((run / "config.json").read_text())
     saved["network"]["width"] = 32.0
     (tmp_path / "config.json").write_text(json.dumps(saved))
