@@ -32,7 +32,7 @@ class FlowConfig(LearnerConfig):
     replay: Uniform = Uniform()
     horizon: int = Field(default=4, ge=1, le=100)
     """Number of actions in a chunk."""
-    executed: int = Field(default=2, ge=1)
+    executed: int = Field(default=1, ge=1)
     """Number of a chunk's first actions that are executed before the policy draws the next
     chunk."""
     steps: int = Field(default=8, ge=1, le=1000)

@@ -13,7 +13,7 @@ from ba_torchrl.training.evaluation import record_episodes
 from ba_torchrl.training.policy import round_weights, save_policy
 from tests.algorithms.tiny import build, make_experiment, transitions
 
-FLOW = {"name": "flow", "optimizer": {"policy_average": 0.5}}
+FLOW = {"name": "flow", "executed": 2, "optimizer": {"policy_average": 0.5}}
 
 
 @pytest.fixture(scope="module")
