@@ -19,6 +19,7 @@ from ba_torchrl.training.checkpoint import (
     find_checkpoint,
     load,
     read_config,
+    read_versions,
     remove_leftovers,
     resumable_updates,
 )
@@ -146,6 +147,17 @@ def test_no_file_of_a_checkpoint_runs_code(run, tmp_path):
 def test_no_file_of_demonstrations_runs_code(demonstrations, tmp_path):
     folder = shutil.copytree(demonstrations, tmp_path / "demos")
     assert_no_file_runs(folder, lambda: load_demonstrations(folder, task=TASK, env=ENV), tmp_path)
+
+
+@pytest.mark.parametrize("name", ["task_version", "expert_version"])
+def test_a_run_without_one_of_its_versions_says_what_to_do(tmp_path, name):
+    saved = {"task_version": 0, "expert_version": 0}
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    assert read_versions(tmp_path) == (0, 0)
+    del saved[name]
+    (tmp_path / "config.json").write_text(json.dumps(saved))
+    with pytest.raises(ConfigError, match=r"has no task_version and expert_version; train again"):
+        read_versions(tmp_path)
 
 
 def test_no_module_that_a_run_names_is_imported(run, monkeypatch):
