@@ -321,7 +321,7 @@ def _command(policy: str, card: Card, settings: list[str], horizon: int) -> str:
     name = card.task.rpartition("/")[2]
     words = [
         f"--dataset.repo_id=ba_torchrl/{name} --dataset.root=$DATA",
-        " ".join(f"--policy.{setting}" for setting in settings),
+        " ".join(shlex.quote(f"--policy.{setting}") for setting in settings),
         f"--batch_size=32 --steps=5000 --output_dir=outputs/{policy}",
     ]
     return _lines("lerobot-train", words)
