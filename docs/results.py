@@ -32,9 +32,11 @@ from ba_torchrl.record.plots import own_style, save
 from ba_torchrl.record.report import plot_groups
 from ba_torchrl.record.summary import (
     GOOD_RATE,
+    Axis,
     Group,
     Run,
     Section,
+    axis_of,
     compare,
     grouped,
     load_runs,
@@ -126,8 +128,9 @@ def _question(section: Section) -> Iterator[str]:
     Differences are those to each task's best method by late success, and all with an interval that
     excludes zero.
     """
-    yield f"![Success over environment steps](results/{section.title}.svg)\n"
-    rows = (_compared_cells(group, section.end(group.task)) for group in section.groups)
+    axis = {"env_steps": "environment steps", "updates": "updates"}[axis_of(section.groups)]
+    yield f"![Success over {axis}](results/{section.title}.svg)\n"
+    rows = (_compared_cells(group, *section.span(group.task)) for group in section.groups)
     yield from pipes(COMPARED, *rows)
     yield ""
     late = {id(group): sum(group.late().values()) / len(group.late()) for group in section.groups}
@@ -151,12 +154,12 @@ def _has(row: Mapping[str, Any], method: str) -> bool:
     return method in (row["first"], row["second"])
 
 
-def _compared_cells(group: Group, end: int) -> list[str]:
+def _compared_cells(group: Group, axis: Axis, end: int) -> list[str]:
     steps = group.reaches(GOOD_RATE)[1]
     return [
         f"`{group.task}`",
         group.method,
-        _mean(list(group.areas(end).values()), ".2f"),
+        _mean(list(group.areas(axis, end).values()), ".2f"),
         _mean(list(group.late().values()), ".2f"),
         _unbroken(success_text(group)),
         "–" if math.isnan(steps) else f"{steps:.0f}",

@@ -32,6 +32,7 @@ from ba_torchrl.record.summary import (
     Group,
     Run,
     Section,
+    axis_of,
     compare,
     differing_settings,
     markdown,
@@ -98,7 +99,8 @@ _DEFINITIONS = (
     f"evaluation. Intervals and shading, {CONFIDENCE:.0%}: Student's t over seeds and the normal "
     "distribution over test scenes, never narrower than Wilson's of one run; that of a single run "
     "does not contain the spread over seeds. Area: mean success of the evaluations during training "
-    "over environment steps, to the last step of all methods on the task. Late: mean of the last "
+    "over environment steps, to the last step of all methods on the task, or over updates if no "
+    "method takes a step. Late: mean of the last "
     f"{LATE} of these evaluations. To "
     f"{GOOD_RATE:.0%}: when the mean curve first reaches that rate. Differences are paired by seed "
     "and test scene, those of area and late success by seed alone."
@@ -196,10 +198,12 @@ def plot_groups(
     Args:
         groups: see `ba_torchrl.record.summary.grouped`.
         paths: of the figure in several formats.
-        axis: of the curves.
+        axis: of the curves; updates if no run takes environment steps.
         methods: in the order of colours; those of the groups if None.
         columns: most panels in a row.
     """
+    if axis == "env_steps":
+        axis = axis_of(groups)
     panels: dict[str, dict[str, Learning]] = {group.task: {} for group in groups}
     for group in groups:
         x, curve = group.axis(axis), group.curve

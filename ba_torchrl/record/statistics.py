@@ -122,13 +122,13 @@ def mean_difference(differences: Sequence[float]) -> Estimate:
 
 
 def area_under_success(steps: Sequence[int], rates: Sequence[float], end: int) -> float:
-    """Return the mean success rate over environment steps, from the first evaluation to ``end``.
+    """Return the mean success rate over steps, from the first evaluation to ``end``.
 
     Rates between evaluations are interpolated linearly; the last one of a run that ended early
     stands for later ones. It is nan without steps between the first evaluation and ``end``.
 
     Args:
-        steps: steps of all environments, demonstrations not counted, [n].
+        steps: of all environments, demonstrations not counted, or updates, [n].
         rates: [n].
         end: last step of all runs that are compared.
     """

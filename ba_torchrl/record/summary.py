@@ -151,11 +151,13 @@ class Group:
         """Tests of the last policies by seed of the run."""
         return {run.result.seed: run.result.last for run in self.runs}
 
-    def areas(self, end: int) -> dict[int, float]:
-        """Return the area under success over steps, until ``end``, by seed of the run."""
+    def areas(self, axis: Axis, end: int) -> dict[int, float]:
+        """Return the area under success over an axis, until ``end``, by seed of the run."""
         return {
             seed: area_under_success(
-                [point.env_steps for point in curve], [point.success_rate for point in curve], end
+                [getattr(point, axis) for point in curve],
+                [point.success_rate for point in curve],
+                end,
             )
             for seed, curve in self.curve_by_seed.items()
         }
@@ -177,6 +179,12 @@ class Group:
             return math.nan, math.nan
         steps = np.mean([curve[reached[0]].env_steps for curve in self.curves])
         return float(self.axis("updates")[reached[0]]), float(steps)
+
+
+def axis_of(groups: Iterable[Group]) -> Axis:
+    """Return environment steps, or updates if no run takes a step."""
+    curves = (curve for group in groups for curve in group.curves)
+    return "env_steps" if any(point.env_steps for curve in curves for point in curve) else "updates"
 
 
 @dataclass(frozen=True)
@@ -203,10 +211,12 @@ class Section:
         """Return the groups of a task."""
         return [group for group in self.groups if group.task == task]
 
-    def end(self, task: str) -> int:
-        """Return the environment steps at the last evaluation of all runs of a task."""
-        curves = (curve for group in self.of_task(task) for curve in group.curves)
-        return max((point.env_steps for curve in curves for point in curve), default=0)
+    def span(self, task: str) -> tuple[Axis, int]:
+        """Return the axis of a task's areas, and its value at the last evaluation of all runs."""
+        groups = self.of_task(task)
+        axis = axis_of(groups)
+        curves = (curve for group in groups for curve in group.curves)
+        return axis, max((getattr(point, axis) for curve in curves for point in curve), default=0)
 
     def on_all_tasks(self) -> list[list[Group]]:
         """Return the groups of each method that ran on every task, in the order of tasks."""
@@ -347,7 +357,7 @@ def _row(section: Section, group: Group) -> dict[str, Any]:
         "episodes": min(test.episodes for test in group.tests),
         **_columns("success", group.success),
         "best": _mean(run.result.best.success_rate for run in group.runs),
-        "area": _mean(group.areas(section.end(group.task)).values()),
+        "area": _mean(group.areas(*section.span(group.task)).values()),
         "late": _mean(group.late().values()),
         "updates_to_80": updates,
         "env_steps_to_80": steps,
@@ -393,7 +403,7 @@ def _comparison(
         least = min(len(first) for first, _ in tests)
         difference = paired_difference(tests)
         area = _difference(
-            [[group.areas(section.end(group.task)) for group in pair] for pair in pairs]
+            [[group.areas(*section.span(group.task)) for group in pair] for pair in pairs]
         )
         late = _difference([[group.late() for group in pair] for pair in pairs])
         notes = [DIRECTION] if least < ENOUGH_SEEDS else []

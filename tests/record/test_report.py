@@ -16,7 +16,7 @@ from ba_torchrl.commands import leaderboard, report
 from ba_torchrl.core.config import FIRST_TEST_SEED
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record.plots import Learning, plot_panels
-from ba_torchrl.record.report import write_report
+from ba_torchrl.record.report import plot_groups, write_report
 from ba_torchrl.record.results import (
     PolicyTest,
     RunResult,
@@ -133,6 +133,20 @@ def test_curves_begin_with_the_untrained_policy_if_all_runs_have_its_evaluation(
     (group,) = section.groups
     assert group.axis("updates").tolist() == [100, 200, 300]
     assert group.curve.value.tolist() == [0.5, 0.9, 0.9]
+
+
+def test_areas_are_over_updates_if_no_method_takes_a_step(tmp_path):
+    point = {"env_steps": 0, "seconds": 1, "episodes": 10, "standard_error": 0.1, "mean_length": 7}
+    curve = [{"updates": 100 * i, "success_rate": rate, **point} for i, rate in enumerate((0.2, 1))]
+    write_run(tmp_path / "bc", (0.2, 1.0), label="bc", curve=curve, env_steps=0)
+    (section,) = load(tmp_path)
+    assert summarize(section)[0]["area"] == pytest.approx(0.6)
+    plot_groups(section.groups, [tmp_path / "curves.svg"])
+    assert "environment steps" not in (svg := (tmp_path / "curves.svg").read_text())
+    assert "updates" in svg
+    write_run(tmp_path / "sac", (0.0, 0.4), updates=(0, 200), label="sac")
+    areas = {row["method"]: row["area"] for row in summarize(load(tmp_path)[0])}
+    assert areas == pytest.approx({"bc": 1.0, "sac": 0.2})
 
 
 def test_figures_over_seeds(tmp_path):
