@@ -31,6 +31,7 @@ from ba_torchrl.record.leaderboard import (
 from ba_torchrl.record.plots import own_style, save
 from ba_torchrl.record.report import plot_groups
 from ba_torchrl.record.summary import (
+    AXES,
     GOOD_RATE,
     Axis,
     Group,
@@ -128,7 +129,7 @@ def _question(section: Section) -> Iterator[str]:
     Differences are those to each task's best method by late success, and all with an interval that
     excludes zero.
     """
-    axis = {"env_steps": "environment steps", "updates": "updates"}[axis_of(section.groups)]
+    axis = AXES[axis_of(section.groups)]
     yield f"![Success over {axis}](results/{section.title}.svg)\n"
     rows = (_compared_cells(group, *section.span(group.task)) for group in section.groups)
     yield from pipes(COMPARED, *rows)

@@ -164,8 +164,8 @@ def _docstrings(model: type[BaseModel]) -> dict[str, str]:
 
 @cache
 def _parsed(module: str) -> ast.Module | None:
-    """Return the source of a module, which `inspect.getsource` would read anew for every class;
-    None of a module without a file."""
+    """Return the parsed source of a module, once for all its classes; None of a module without a
+    file."""
     try:
         return ast.parse(inspect.getsource(sys.modules[module]))
     except (OSError, TypeError, KeyError):

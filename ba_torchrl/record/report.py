@@ -23,6 +23,7 @@ from ba_torchrl.record.plots import Learning, plot_panels
 from ba_torchrl.record.results import CITABLE_EPISODES, file_of, now, why_unfinished
 from ba_torchrl.record.statistics import CONFIDENCE
 from ba_torchrl.record.summary import (
+    AXES,
     DIRECTION,
     ENOUGH_SEEDS,
     GOOD_RATE,
@@ -222,8 +223,7 @@ def plot_groups(
             float(np.mean(demonstrations)) if axis == "env_steps" else 0.0,
         )
     names = methods or sorted({group.method for group in groups})
-    xlabel = {"env_steps": "environment steps", "updates": "updates"}[axis]
-    plot_panels(panels, paths, names=names, xlabel=xlabel, columns=columns)
+    plot_panels(panels, paths, names=names, xlabel=AXES[axis], columns=columns)
 
 
 def _part(section: Section, name: str, folder: Path, axis: Axis) -> dict[str, Any]:

@@ -41,6 +41,8 @@ from ba_torchrl.record.statistics import (
 logger = logging.getLogger(__name__)
 
 Axis = Literal["env_steps", "updates"]
+AXES: dict[Axis, str] = {"env_steps": "environment steps", "updates": "updates"}
+"""In words."""
 Changes = Callable[[RunResult], Mapping[str, tuple[Any, Any]]]
 """From a run to the settings in which it differs from its benchmark: its value and the benchmark's,
 by name."""
