@@ -16,6 +16,9 @@ from lerobot.envs.utils import freeze_after_episode_end
 
 from ba_torchrl.envs.lerobot import ENVIRONMENT_STATE, GYM_NAMES, STATE, LeRobotEnv
 
+__path__: list[str] = []
+"""Has no modules below it: LeRobot's `--env.discover_packages_path` asks every package for them."""
+
 
 @EnvConfig.register_subclass("ba_torchrl")
 @dataclass

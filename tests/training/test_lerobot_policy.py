@@ -3,6 +3,7 @@
 import json
 import sys
 from collections import deque
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -155,39 +156,34 @@ def test_a_folder_that_is_no_checkpoint_is_one_sentence(checkpoint, monkeypatch)
 @pytest.mark.parametrize(
     ("kind", "settings"),
     [
-        ("act", {"chunk_size": 8, "dim_model": 32, "n_heads": 2, "dim_feedforward": 32}),
-        ("diffusion", {"horizon": 8, "down_dims": (32, 64), "num_inference_steps": 2}),
+        ("act", "chunk_size=8 dim_model=32 n_heads=2 dim_feedforward=32"),
+        (
+            "diffusion",
+            "horizon=8 down_dims=[32,64] num_inference_steps=2 drop_n_last_frames=0 "
+            "use_group_norm=true",
+        ),
     ],
 )
 def test_stock_policies_train_on_the_export_and_act(kind, settings, tmp_path, monkeypatch):
     pytest.importorskip("lerobot")
-    from lerobot.configs.default import DatasetConfig
-    from lerobot.configs.train import TrainPipelineConfig
-    from lerobot.policies.factory import make_policy_config
-    from lerobot.scripts.lerobot_train import train
+    from lerobot.scripts import lerobot_train
 
     episodes = demonstrations(TASK, 2, env=ENV)
     data = tmp_path / "picking"
     export_demonstrations(data, episodes, format="lerobot", task=TASK, env=ENV, seed=0)
-    policy = make_policy_config(
-        kind,
-        device="cpu",
-        push_to_hub=False,
-        n_action_steps=4,
-        pretrained_backbone_weights=None,
-        **({"drop_n_last_frames": 0} if kind == "diffusion" else {}),
-        **settings,
-    )
-    config = TrainPipelineConfig(
-        dataset=DatasetConfig(repo_id="ba_torchrl/picking", root=str(data)),
-        policy=policy,
-        output_dir=tmp_path / "out",
-        steps=2,
-        batch_size=2,
-        num_workers=0,
-    )
-    monkeypatch.setattr(sys, "argv", ["lerobot-train"])
-    train(config)
+    settings += f" type={kind} n_action_steps=4 pretrained_backbone_weights=null"
+    settings += " device=cpu push_to_hub=false"
+    words = [f"--dataset.repo_id=ba_torchrl/picking --dataset.root={data} --output_dir=out"]
+    words += [f"--policy.{setting}" for setting in settings.split()]
+    words += ["--steps=2 --batch_size=2 --num_workers=0 --env_eval_freq=2 --eval.n_episodes=2"]
+    words += [f"--env.type=ba_torchrl --env.task={TASK} --eval.use_async_envs=false"]
+    words += ["--env.discover_packages_path=lerobot_env_ba_torchrl"]
+    monkeypatch.syspath_prepend(Path(ba_torchrl.__file__).parents[1] / "lerobot_env")
+    monkeypatch.chdir(tmp_path)
+    words = ["lerobot-train", *" ".join(words).split(), f"--env.parameters={json.dumps(ENV)}"]
+    monkeypatch.setattr(sys, "argv", words)
+    lerobot_train.main()
+    assert len([*Path("out/eval").rglob("*.mp4")]) == 2  # its evaluation during the training
     acting = load_lerobot(tmp_path / "out")
     assert acting.updates == 2
     env = acting.make_env(seed=0)

@@ -293,12 +293,19 @@ def _page(view: PolicyView, card: Card) -> str:
         length=length,
         horizon=horizon,
         executed=horizon // 2,
-        act=_command("act", card, [f"chunk_size={horizon}", "optimizer_lr=1e-4"], horizon),
+        act=_command(
+            "act",
+            card,
+            # from scratch, the backbone learns as fast as the rest
+            [f"chunk_size={horizon}", "optimizer_lr=1e-4", "optimizer_lr_backbone=1e-4"],
+            horizon,
+        ),
         diffusion=_command(
             "diffusion",
             card,
             [
                 f"horizon={horizon}",
+                "use_group_norm=true",  # as in Chi et al. (2023) without pretrained weights
                 "drop_n_last_frames=0",
                 "do_mask_loss_for_padding=true",
                 "down_dims=[128,256,512]",
