@@ -8,7 +8,7 @@ import os
 import re
 import shlex
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +20,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 from yaml import ScalarEvent, YAMLError, parse as parse_yaml
 
-from ba_torchrl.cli import PROGRAM, config_dir
+from ba_torchrl.cli import PROGRAM, config_dir, no_collection
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.core.config import defaults_of, expanded, parse, takes_list, takes_text
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
@@ -91,24 +91,27 @@ class Command:
         arguments = self.read(sys.argv[1:] if words is None else words)
         plugins = arguments.given.get("plugins", ())
         load_plugins([plugins] if isinstance(plugins, str) else plugins)
+        if arguments.asks_for_help:
+            with no_collection():
+                print(self._help(arguments))  # noqa: T201
+            return
         with self.composed(arguments) as settings:
-            if arguments.asks_for_help:
-                from ba_torchrl.cli.help import describe
-
-                words = "".join(f" [{name.upper()}]" for name in (self.positional or "").split())
-                usage = f"{self.name}{words} [FIELD=VALUE ...]"
-                text = sys.modules[self.main.__module__].__doc__ or ""
-                values = OmegaConf.to_container(settings)
-                print(describe(usage, text, self.settings, values, self.config_names()))  # noqa: T201
-                return
             logging.basicConfig(level=logging.INFO, format=LOG_FORMAT, stream=sys.stdout)
             limit_library_logs()
             self._run(arguments, settings)
 
+    def _help(self, arguments: Arguments) -> str:
+        from ba_torchrl.cli.help import describe
+
+        words = "".join(f" [{name.upper()}]" for name in (self.positional or "").split())
+        usage = f"{self.name}{words} [FIELD=VALUE ...]"
+        text = sys.modules[self.main.__module__].__doc__ or ""
+        with self.composed(arguments) as settings:
+            values = OmegaConf.to_container(settings)
+            return describe(usage, text, self.settings, values, self.config_names())
+
     def _run(self, arguments: Arguments, settings: DictConfig) -> None:
-        for name in settings:
-            if name not in self.fields:
-                raise UnknownNameError("setting", name, self.fields)
+        self._check_names(settings)
         for name, info in self.fields.items():
             if OmegaConf.is_missing(settings, name) or (
                 name in self.settings.model_fields and info.is_required() and name not in settings
@@ -158,6 +161,11 @@ class Command:
         bare = [word for word in rest if self._is_bare(word)]
         settings = [word for word in rest if word not in bare]
         presets = [word for word in settings if self._is_preset(word, folder)]
+        for word in presets:
+            group, _, value = word.lstrip("+").partition("=")
+            if f"{group}s" in self.fields:
+                text = f"{self.name} takes a list of presets; write {group}s=[{value}]"
+                raise ConfigError(f"{group}: {text}")
         given = OmegaConf.create()
         for word in settings:
             if word not in presets:
@@ -165,7 +173,14 @@ class Command:
         if bare:
             given.update(self._positional(bare, given))
         values = OmegaConf.to_container(given)
+        if not found.help:
+            self._check_names(values)  # before presets are composed, which takes most of the time
         return Arguments(values, presets, found.config_name, folder, found.help)
+
+    def _check_names(self, names: Iterable[str]) -> None:
+        for name in names:
+            if name not in self.fields:
+                raise UnknownNameError("setting", name, self.fields)
 
     def _is_bare(self, word: str) -> bool:
         """Whether a word is the value of a positional field, such as a path with "=" or "~"."""

@@ -8,12 +8,14 @@ import os
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from ba_torchrl.record.results import flat
+
+if TYPE_CHECKING:
+    from tqdm import tqdm
 
 Backend = Literal["csv", "tensorboard", "wandb"]
 """The file alone, or also one of TorchRL's loggers."""
@@ -40,6 +42,8 @@ def limit_library_logs() -> None:
 
 def progress_bar(**settings: Any) -> tqdm:
     """Return a progress bar, with fewer updates if it is written to a file."""
+    from tqdm import tqdm
+
     return tqdm(mininterval=0.1 if sys.stderr.isatty() else FILE_INTERVAL_S, **settings)
 
 

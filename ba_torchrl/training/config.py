@@ -36,7 +36,6 @@ from ba_torchrl.core.plugins import MAIN, load_plugins
 from ba_torchrl.core.seeds import SeedUse, derive_seed
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
 from ba_torchrl.record.logging import Backend
-from ba_torchrl.tasks.structures.open_loop import check_has_structure
 from ba_torchrl.training.collectors.config import COLLECTORS, CollectorConfig
 
 if TYPE_CHECKING:
@@ -300,6 +299,8 @@ class ExperimentConfig(WorkerOptions):
             "demonstrations_turn_noise",
         )
         if self.demonstrations and self.demonstrations_source == "deconstruction":
+            from ba_torchrl.tasks.structures.open_loop import check_has_structure
+
             check_has_structure(self.task)
         if self.demonstrations_path is not None:
             if not self.demonstrations:

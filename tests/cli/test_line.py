@@ -1,5 +1,6 @@
 """The command line: names, mistakes, help, and what it is given to resume."""
 
+import gc
 import json
 import signal
 import subprocess
@@ -69,6 +70,13 @@ def test_help_and_mistakes_are_answered_without_torch():
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+def test_an_unknown_setting_is_answered_before_presets_are_composed(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "ba_torchrl.training.presets", None)
+    line = refused(["train", "network=cnnn", "seeed=1"], capsys)
+    assert "unknown setting 'seeed'. Did you mean 'seed'?" in line
+    assert gc.isenabled()  # which is off during imports
+
+
 @pytest.mark.parametrize("words", [["train", "--help"], ["tasks"]])
 def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
     code = (
@@ -87,6 +95,7 @@ def test_the_end_of_the_reader_ends_a_command_silently(words, tmp_path):
         (["train", "--confg-name", "x"], "unknown option '--confg-name'. Did you mean '--config"),
         (["train", "--total_updates", "10"], "'--total_updates': write total_updates=10"),
         (["train", "--resume"], "write resume=VALUE"),
+        (["benchmark", "network=cnn"], "network: benchmark takes a list of presets; write network"),
         (["benchmark", "--tasks=[a,b]"], "write 'tasks=[a,b]'"),
         (["train", "--multirun", "seed=1,2"], "unknown option '--multirun'. Known: --help, "),
         (["train", "--config-name", "quikstart"], "Did you mean 'quickstart'?"),
