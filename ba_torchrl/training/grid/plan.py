@@ -187,6 +187,11 @@ def expand(
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
+        for axis in ("algorithm", "network"):
+            other = given.get(axis)
+            if isinstance(other, Mapping) and "name" in other:  # labels have the names of the axis
+                name = f"{axis}.name={other['name']}"
+                raise ConfigError(f"{name}: set by the benchmark; write {axis}s=[{other['name']}]")
         if isinstance(path := values.get("demonstrations_path"), str):
             values["demonstrations_path"] = path.replace("{task}", task)
         label = " ".join(filter(None, (algorithm, network, variant)))

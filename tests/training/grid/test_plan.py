@@ -3,7 +3,6 @@
 import pytest
 
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.modules import EquivariantConfig
 from ba_torchrl.training.graded import GradedSets
 from tests.training.grid.grids import COMMON, PICK, PLACE, PRESETS, REACH, planned
 
@@ -53,16 +52,6 @@ def test_the_more_specific_override_wins(tmp_path):
     assert PRESETS["network", "small"] == {"name": "cnn", "width": 0.25}
 
 
-def test_another_network_of_one_task_keeps_the_fields_that_it_has(tmp_path):
-    own = {"network": {"name": "equi", "n_hidden": 8}}
-    common = {"algorithm": {"batch_size": 8, "imitation": {"name": "none"}}}
-    (run,) = planned(tmp_path, seeds=1, per_task={REACH: own}, common=common)
-    assert run.network == EquivariantConfig(n_hidden=8)  # without the width of the preset
-    own["network"]["width"] = 0.5
-    with pytest.raises(ConfigError, match="unknown parameter 'width'"):
-        planned(tmp_path, seeds=1, per_task={REACH: own}, common=common)
-
-
 def test_skip_leaves_out_matching_runs(tmp_path):
     runs = planned(
         tmp_path,
@@ -99,6 +88,11 @@ def test_skip_leaves_out_matching_runs(tmp_path):
         ({"sedes": 3}, "Did you mean 'seeds'"),
         ({"common": {"total_update": 5}}, "Did you mean 'total_updates'"),
         ({"common": {"seed": 5}}, "seed: set by the benchmark"),
+        ({"common": {"network": {"name": "equi"}}}, "network.name=equi.*write networks=.equi."),
+        (
+            {"per_task": {REACH: {"algorithm": {"name": "rlpd"}}}},
+            "algorithm.name=rlpd.*write algorithms=.rlpd.",
+        ),
         ({"common": {"network": {"widht": 1.0}}}, "with sac small: .*Did you mean 'width'"),
         ({"common": {"env": {"in_hand_size": 30}}}, f"{REACH}.*: 'in_hand_size' is for open-loop"),
         ({"common": {"env": {"robot": "sawyer"}}}, "kuka"),
