@@ -7,7 +7,7 @@ import threading
 import pytest
 import torch
 
-from ba_torchrl.envs.vector.worker import end_with
+from ba_torchrl.core.processes import end_with
 
 
 def pytest_configure(config):

@@ -20,6 +20,7 @@ CODE = """
 import os, sys
 os.setsid()
 sys.stdin = open("config.pkl")
+sys.argv[1:] = ["run", str(os.getppid())]
 from ba_torchrl.training.grid.run_one import main
 main()
 """

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ctypes
 import os
 import pickle
 import signal
 import socket
 import struct
-import sys
 import threading
 import time
 import traceback
@@ -30,13 +28,12 @@ from typing_extensions import Self
 
 from ba_torchrl.core.config import WorkerOptions
 from ba_torchrl.core.errors import ConfigError, RepeatedFaultError, WorkerError
+from ba_torchrl.core.processes import end_with
 from ba_torchrl.envs.vector.batching import MakeEnv
 from ba_torchrl.sim.world import SIMULATOR_ERRORS
 
 T = TypeVar("T")
 Slot = tuple[TensorDictBase, TensorDictBase]
-
-_PR_SET_PDEATHSIG = 1
 
 
 class EnvironmentRaisedError(WorkerError):
@@ -320,18 +317,6 @@ def _limit_sending(pipe: Connection, seconds: float) -> None:
 def _kill(process: BaseProcess) -> None:
     process.kill()
     process.join()
-
-
-def end_with(parent: int) -> None:
-    """Let the kernel kill this process when its parent ends, even if it hangs or is stopped.
-
-    Args:
-        parent: process id of the parent, whose main thread started this process.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # it ended before
-            os._exit(1)
 
 
 def start_process(process: BaseProcess) -> None:

@@ -21,8 +21,9 @@ from torch import multiprocessing as mp
 from torchrl.collectors import Collector, MultiAsyncCollector, MultiSyncCollector
 from torchrl.weight_update import MultiProcessWeightSyncScheme
 
+from ba_torchrl.core.processes import end_with
 from ba_torchrl.envs.episode_positions import EpisodePosition
-from ba_torchrl.envs.vector.worker import SentError, end_with, is_of_code
+from ba_torchrl.envs.vector.worker import SentError, is_of_code
 from ba_torchrl.training.collectors.base import CollectionProblem
 from ba_torchrl.training.collectors.config import WorkersConfig
 from ba_torchrl.training.collectors.multi_config import MultiAsyncConfig, MultiSyncConfig

@@ -54,8 +54,7 @@ def run_all(
         jobs: number of runs at the same time.
         max_hours: time limit of each run.
         progress: show a progress bar over the runs.
-        worker: command that reads a run's pickled configuration from its standard input; its
-            argument is the run's folder, so that lists of processes name it.
+        worker: command of a process such as `run_one`.
 
     Returns:
         By run folder, the reason of its failure, also of a run whose files cannot be read. Runs
@@ -157,7 +156,7 @@ class _Job:
         (run.folder / FAILURE_FILE).unlink(missing_ok=True)
         with (run.folder / LOG_FILE).open("a") as log:
             self._process = subprocess.Popen(
-                [*worker, str(run.folder)],
+                [*worker, str(run.folder), str(os.getpid())],
                 stdin=subprocess.PIPE,
                 stdout=log,
                 stderr=log,

@@ -1,18 +1,21 @@
 """One run of a benchmark; the process reads its pickled configuration from the standard input.
 
-Environments in processes of their own import this module again, so everything else is imported
-where it is needed.
+Its arguments are the run's folder, so that lists of processes name it, and the process id of the
+grid, with which the run ends. Environments in processes of their own import this module again, so
+everything else is imported where it is needed.
 """
 
+import signal
+import sys
+
 from ba_torchrl.core.malloc import tune_malloc
+from ba_torchrl.core.processes import end_with
 
 
 def main() -> None:
     """Run the experiment."""
+    end_with(int(sys.argv[2]), signal.SIGTERM)  # so that it saves its state
     tune_malloc()  # before torch allocates anything
-
-    import sys
-
     run_experiment(sys.stdin.buffer.read())
 
 
