@@ -39,7 +39,7 @@ GRIDS = {
     "cpu_six_dof": (9, 9),
     "demonstrations": (1, 6),
     "equivariance": (1, 4),
-    "equivariance_imitation": (2, 18),
+    "equivariance_imitation": (2, 24),
     "flow": (5, 55),
     "imitation": (2, 12),
     "open_loop_2d": (12, 96),
