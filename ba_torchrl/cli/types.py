@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, BeforeValidator, Field, field_validator
 
-from ba_torchrl.core.config import MAX_ENVS, MAX_SEED, LocalPath, StrictModel
+from ba_torchrl.core.config import MAX_ENVS, LocalPath, Seed as Seed, StrictModel
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.tasks.base import TASKS
@@ -80,7 +80,6 @@ as_list = BeforeValidator(lambda value: [value] if isinstance(value, str) else v
 """Annotation of a list that may be given as its only item."""
 Count = Annotated[int, Field(ge=1)]
 NumEnvs = Annotated[int, Field(ge=1, le=MAX_ENVS)]
-Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 Fps = Annotated[float, Field(ge=1, le=240)]
 Text = Annotated[str, Field(min_length=1)]
 Plugins = Annotated[list[str], checked(load_plugins)]

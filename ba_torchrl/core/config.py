@@ -447,6 +447,7 @@ class WorkerOptions(StrictModel):
 
 MAX_SEED = 2**52 - 1
 """The largest seed of a run or a command. Seeds that are derived from it are below 2**32."""
+Seed = Annotated[int, Field(ge=0, le=MAX_SEED)]
 FIRST_TEST_SEED = 9 * 10**15
 """Seed of the first episode of a test; see `ba_torchrl.training.protocol`. It is exact as a number
 of JSON, below 2**53. Its upper 32 bits are above two million: NumPy's seeds [a + 2**32 b, 0] and

@@ -20,7 +20,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 from typing_extensions import Self
 
 from ba_torchrl import __version__
-from ba_torchrl.core.config import FIRST_TEST_SEED, MAX_SEED, PROTOCOL, StrictModel, explain
+from ba_torchrl.core.config import FIRST_TEST_SEED, PROTOCOL, Seed, StrictModel, explain
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.files import header_texts, json_bytes, read_json, write_text
 
@@ -151,7 +151,7 @@ class RunResult(StrictModel):
     """Name of the method, such as "sacfd equi"."""
     benchmark: str | None
     """The benchmark that the run belongs to."""
-    seed: Annotated[int, Field(ge=0, le=MAX_SEED)]
+    seed: Seed
     curve: list[CurvePoint]
     """Evaluations in the order of updates, the first of the untrained policy."""
     last: PolicyTest

@@ -21,11 +21,11 @@ from pydantic import (
 
 from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS, LearnerConfig, NetworkConfig
 from ba_torchrl.core.config import (
-    MAX_SEED,
     Chosen,
     CompileMode,
     InnerError,
     LocalPath,
+    Seed,
     Source,
     WorkerOptions,
     parse,
@@ -63,7 +63,7 @@ class ExperimentConfig(WorkerOptions):
     """``name`` of a registered algorithm and its hyper-parameters."""
     network: Annotated[NetworkConfig, Chosen(NETWORKS)]
     """``name`` of a registered network and its hyper-parameters."""
-    seed: int = Field(default=0, ge=0, le=MAX_SEED)
+    seed: Seed = 0
     """Seed of networks, environments, replay and augmentation."""
     device: str = "auto"
     """Where the learner runs; "auto" takes a GPU if there is one."""

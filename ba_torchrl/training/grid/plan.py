@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
 from pydantic import Field
 
-from ba_torchrl.core.config import Chosen, LocalPath, StrictModel, parse
+from ba_torchrl.core.config import Chosen, LocalPath, Seed, StrictModel, parse
 from ba_torchrl.core.errors import ConfigError, OtherRunError, UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.results import (
@@ -56,7 +56,7 @@ class BenchmarkConfig(StrictModel):
     """Names of preset files in ``configs/network``."""
     variants: list[str] = Field(default_factory=lambda: [""], min_length=1)
     """Names of settings in `per_variant`, a further axis; the empty name changes nothing."""
-    seeds: Annotated[int, Field(ge=1, le=1000)] | list[int] = 4
+    seeds: Annotated[int, Field(ge=1, le=1000)] | list[Seed] = 4
     """A number of seeds, from 0 on, or a list of seeds."""
     skip: list[dict[str, str | list[str]]] = Field(default_factory=list)
     """Runs to leave out: each entry gives a name or a list of names for ``task``, ``algorithm``,
@@ -132,7 +132,7 @@ def plan(
     Args, order and errors are as in `expand`.
     """
     runs = expand(config, common, preset)
-    _check_parts(runs)
+    _check_parts(runs[: len(runs) // len(config.seed_list())])  # other seeds have the same parts
     return runs
 
 
@@ -161,15 +161,10 @@ def expand(
         for group, names in (("algorithm", config.algorithms), ("network", config.networks))
         for name in names
     }
-    runs = []
-    for seed, *cell in product(
-        config.seed_list(),
-        config.tasks,
-        config.algorithms,
-        config.networks,
-        config.variants,
+    cells = []
+    for task, algorithm, network, variant in product(
+        config.tasks, config.algorithms, config.networks, config.variants
     ):
-        task, algorithm, network, variant = cell
         if config.skips(task=task, algorithm=algorithm, network=network, variant=variant):
             continue
         given = _merged(
@@ -187,7 +182,7 @@ def expand(
         taken = [name for name in SET_BY_THE_GRID if name in values]
         if taken:
             raise ConfigError(f"{', '.join(taken)}: set by the benchmark; leave it out")
-        for axis in ("algorithm", "network"):
+        for axis in chosen:
             other = given.get(axis)
             if isinstance(other, Mapping) and "name" in other:  # labels have the names of the axis
                 name = f"{axis}.name={other['name']}"
@@ -196,19 +191,22 @@ def expand(
             values["demonstrations_path"] = path.replace("{task}", task)
         label = " ".join(filter(None, (algorithm, network, variant)))
         names = (name.replace("/", "_").replace(" ", "_") for name in (task, label))
-        where = Path(config.folder, *names, f"seed{seed}")
         values |= {
             "task": task,
-            "seed": seed,
             "label": label,
             "benchmark": config.name,
-            "run_dir": str(where),
+            "run_dir": str(Path(config.folder, *names)),
             "resume": True,
         }
         try:
-            runs.append(ExperimentConfig.parse(values, given=flat(given)))
+            cells.append(ExperimentConfig.parse(values, given=flat(given)))
         except ConfigError as error:
             raise ConfigError(f"{task} with {label}: {error}") from None
+    runs = [
+        cell.model_copy(update={"seed": seed, "run_dir": str(cell.folder / f"seed{seed}")})
+        for seed in config.seed_list()
+        for cell in cells
+    ]
     if not runs:
         raise ConfigError("the grid is empty: `skip` leaves everything out")
     owners: dict[Path, ExperimentConfig] = {}

@@ -46,7 +46,8 @@ class TestSeeds:
 
     @pytest.mark.parametrize("parallel", [False, True])
     def test_none_is_a_random_one(self, parallel):
-        options = {"parallel": parallel, "obs_type": "vec"}  # a small image need not show the block
+        # a small image need not show the block
+        options = {"parallel": parallel, "start_method": "fork", "obs_type": "vec"}
         env = ba_torchrl.make_vector_env("close_loop/block_reaching", 2, **options)
         try:
             seen = []
