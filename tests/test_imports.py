@@ -2,13 +2,11 @@
 
 import ast
 import io
-import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
-import pytest
 import tomllib
 
 from ba_torchrl import sim
@@ -179,37 +177,31 @@ def test_no_two_files_import_each_other():
     assert circles(imports) == set()
 
 
-def loaded_after(imports):
-    """Return the top-level packages a fresh interpreter holds after importing ``imports``."""
+LIGHT = (
+    ((), LEARNING | {"pybullet", "numba", "gymnasium", "pydantic"}),
+    (("sim", "tasks"), LEARNING),
+    (("envs",), {"matplotlib", "hydra", "omegaconf", "imageio_ffmpeg"}),  # of workers
+)
+"""Parts, and the packages that an interpreter has not loaded after it imported the package, then
+all modules of these parts and of those above them."""
+
+
+def test_the_package_and_its_workers_stay_light():
+    stages = []
+    for parts, heavy in LIGHT:
+        names = [name for part in parts for name in modules_below(f"{PACKAGE}/{part}")]
+        assert len(names) > 10 or not parts
+        stages.append((names or [PACKAGE], heavy))
     code = (
-        "import importlib, json, sys\n"
-        f"for name in {list(imports)!r}: importlib.import_module(name)\n"
-        "print(json.dumps(sorted({name.split('.')[0] for name in sys.modules})))"
+        f"import importlib, sys\nfor names, heavy in {stages!r}:\n"
+        "    for name in names: importlib.import_module(name)\n"
+        "    loaded = {name.split('.')[0] for name in sys.modules}\n"
+        "    assert not loaded & heavy, (names[0], loaded & heavy)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert done.returncode == 0, done.stderr
-    return set(json.loads(done.stdout.splitlines()[-1]))
-
-
-def test_the_package_itself_is_light():
-    loaded = loaded_after([PACKAGE])
-    assert PACKAGE in loaded
-    assert not loaded & (LEARNING | {"pybullet", "numba", "gymnasium", "pydantic"})
-
-
-@pytest.mark.parametrize(
-    ("parts", "heavy"),
-    [
-        (("sim", "tasks"), LEARNING),
-        (("envs",), {"matplotlib", "hydra", "omegaconf", "imageio_ffmpeg"}),
-    ],
-)
-def test_workers_stay_light(parts, heavy):
-    names = [name for part in parts for name in modules_below(f"{PACKAGE}/{part}")]
-    assert len(names) > 10
-    assert not loaded_after(names) & heavy
 
 
 def test_requirements_fit_the_package():

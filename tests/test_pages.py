@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ba_torchrl.cli import command_names, main
+from ba_torchrl.cli import command_names
 from ba_torchrl.cli.command import Command
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.envs.observations import vector_names
@@ -89,11 +89,9 @@ def test_brackets_in_a_command_of_a_page_are_quoted(page):
     assert unquoted("\n".join([*blocks(page, ""), *blocks(page, "bash"), *spans])) == []
 
 
-def test_brackets_in_a_command_of_a_help_or_a_configuration_are_quoted(capsys):
-    for name in command_names():
-        main([name, "--help"])
+def test_brackets_in_a_command_of_a_recipe_or_a_configuration_are_quoted():
     sources = [path.read_text() for path in (ROOT / "recipes").glob("*.py")]
-    texts = [capsys.readouterr().out, *(ast.get_docstring(ast.parse(text)) for text in sources)]
+    texts = [ast.get_docstring(ast.parse(text)) for text in sources]
     configs = (path.read_text() for path in (ROOT / "configs").rglob("*.yaml"))
     comments = re.findall(r"#.*", "\n".join(configs))
     assert unquoted("\n".join([*texts, *comments])) == []

@@ -43,25 +43,27 @@ def test_the_notebook_of_sac_trains_from_poses():
     assert "test: success rate " in found.cells[-1].outputs[-1].text
 
 
-@pytest.mark.parametrize("kind", ["task", "algorithm", "network"])
-def test_what_the_command_writes_passes_its_own_test(kind, tmp_path, monkeypatch, capsys):
+def test_what_the_command_writes_passes_its_own_test(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
-    cli.main(["new", kind, "push_far"])
-    lines = capsys.readouterr().out.splitlines()
-    assert lines[:2] == [
-        "push_far.py and test_push_far.py are written. Next:",
-        "  python -m pytest test_push_far.py",
-    ]
-    text = (tmp_path / "push_far.py").read_text() + (tmp_path / "test_push_far.py").read_text()
-    assert '.register("mine/push_far")' in text
-    assert "my_" not in text.lower()
-    commands = [line for line in lines[2:] if line.startswith("  ba-torchrl ")]
+    commands, tests = [], []
+    for kind, name in (("task", "push_far"), ("algorithm", "far_sac"), ("network", "far_net")):
+        cli.main(["new", kind, name])
+        lines = capsys.readouterr().out.splitlines()
+        tests.append(f"test_{name}.py")
+        assert lines[:2] == [
+            f"{name}.py and {tests[-1]} are written. Next:",
+            f"  python -m pytest {tests[-1]}",
+        ]
+        text = Path(f"{name}.py").read_text() + Path(tests[-1]).read_text()
+        assert f'.register("mine/{name}")' in text
+        assert "my_" not in text.lower()
+        commands += [line for line in lines[2:] if line.startswith("  ba-torchrl ")]
     code = (
         "import pytest\nfrom tests.test_pages import check_command_line\n"
         f"for line in {commands}:\n    check_command_line(line)\n"
-        "raise SystemExit(pytest.main(['-q', 'test_push_far.py']))\n"
+        f"raise SystemExit(pytest.main(['-q', *{tests}]))\n"
     )
-    assert "passed" in run_script(tmp_path, code).stdout
+    assert re.search("^6 passed", run_script(tmp_path, code).stdout, re.MULTILINE)
 
 
 @pytest.mark.parametrize("kind", ["task", "algorithm", "network"])

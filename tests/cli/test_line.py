@@ -18,6 +18,7 @@ from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.config import ExperimentConfig
 from tests.fresh import run_script
 from tests.recipes import load_recipe
+from tests.test_pages import unquoted
 from tests.training.test_experiment import tiny
 
 
@@ -179,10 +180,11 @@ def test_the_help_describes_every_setting(name, capsys):
     assert descriptions(model).keys() == model.model_fields.keys()
     for field in model.model_fields:
         assert f"\n  {field}" in out or f"\n  '{field}=" in out
+    assert unquoted(out) == []
 
 
 def test_the_help_shows_the_fields_of_the_chosen_presets_and_their_choices(capsys):
-    cli.main(["--help", "train", "algorithm=dqn", "task=open_loop/bin_packing"])
+    cli.main(["--help", "train", "algorithm=dqn", "task=open_loop/bin_packing", "seeed=1"])
     out = capsys.readouterr().out
     assert "algorithm.epsilon_" in out
     assert "env.robot=kuka   {kuka, panda, ur5, ur5_robotiq}" in out
@@ -235,6 +237,9 @@ def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch)
     (tmp_path / "my_grid.yaml").write_text("defaults: [benchmark, _self_]\nseeds: 9\n")
     cli.main(["benchmark", "--config-dir", ".", "--config-name", "my_grid", "--help"])
     assert "  seeds=9" in capsys.readouterr().out
+    (tmp_path / "my_grid.yaml").write_text("defaults: [benchmark, _self_]\nsedes: 9\n")
+    line = refused(["benchmark", "--config-dir", ".", "--config-name", "my_grid"], capsys)
+    assert "unknown setting 'sedes'. Did you mean 'seeds'" in line
 
 
 def test_an_interruption_while_a_command_is_imported_is_one_line(monkeypatch, capsys):
