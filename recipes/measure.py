@@ -17,7 +17,7 @@ from typing import Annotated  # noqa: E402
 from ba_torchrl.cli.command import Command  # noqa: E402
 from ba_torchrl.cli.types import Count, PluginSettings, Text, check_writable_file, checked  # noqa: E402
 from ba_torchrl.core.config import LocalPath  # noqa: E402
-from ba_torchrl.training.config import usable_device  # noqa: E402
+from ba_torchrl.core.hardware import usable_device  # noqa: E402
 from profiling.comparison import columns_of_changes  # noqa: E402
 from profiling.speed_file import (  # noqa: E402
     Machine,

@@ -125,8 +125,8 @@ def test_the_label_names_the_parts_that_replace_those_of_presets(overrides, labe
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("bc_per", "replay.name: Input should be 'uniform'"),
-        ("rlpd_per", "replay.name: Input should be 'symmetric'"),
+        ("bc_per", "replay.name: must be 'uniform'"),
+        ("rlpd_per", "replay.name: must be 'symmetric'"),
         ("iql_so2", "unknown parameter 'rotation'"),
         ("sdqfd_so2", "unknown rotation.name 'sampled'.*Known: none, translation, d4"),
         ("sacfd_so2_per", "unknown algorithm 'sacfd_so2_per'.*Known: .*sacfd"),

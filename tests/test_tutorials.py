@@ -82,7 +82,7 @@ def test_the_name_that_the_tutorial_gives_is_free(kind, tmp_path, monkeypatch):
         (["task", "a-b"], "'a-b' is no name of a module"),
         (["task", "_1"], "'_1' gives no name to its class"),
         (["task", "box"], "imports another Box"),
-        (["tasks", "a"], "kind: Input should be 'task', 'algorithm' or 'network'"),
+        (["tasks", "a"], "kind: must be 'task', 'algorithm' or 'network'"),
         (["task"], "name is missing"),
         (["task", "a", "b"], "'b' sets nothing"),
         (["task", "kind=network"], "kind is given twice"),

@@ -102,7 +102,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
             sys.stderr.write(f"error: {end}\n")
             sys.exit(EXIT_CODE)
     else:
-        sys.stderr.write(f"error: {UnknownNameError('command', first, command_names())}\n")
+        kind, known = "command", command_names()
+        if first.startswith("-"):
+            kind, known = "option", ["--help", "--version"]
+        sys.stderr.write(f"error: {UnknownNameError(kind, first, known)}\n")
         sys.exit(EXIT_CODE)
 
 

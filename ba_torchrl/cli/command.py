@@ -23,6 +23,7 @@ from yaml import ScalarEvent, YAMLError, parse as parse_yaml
 from ba_torchrl.cli import PROGRAM, config_dir, no_collection
 from ba_torchrl.cli.errors import plain_errors
 from ba_torchrl.core.config import defaults_of, expanded, parse, takes_list, takes_text
+from ba_torchrl.core.env_config import EnvConfig
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.core.plugins import load_plugins
 from ba_torchrl.record.logging import limit_library_logs
@@ -116,7 +117,9 @@ class Command:
             if OmegaConf.is_missing(settings, name) or (
                 name in self.settings.model_fields and info.is_required() and name not in settings
             ):
-                raise ConfigError(f"{name} is missing; see --help")
+                is_word = name in (self.positional or "").split()
+                how = f"{PROGRAM} {self.name} {name.upper()}" if is_word else f"write {name}=..."
+                raise ConfigError(f"{name} is missing: {how}; see --help")
         values = OmegaConf.to_container(settings, resolve=True, throw_on_missing=True)
         try:
             if self.parse is None:
@@ -129,6 +132,21 @@ class Command:
 
                 name_presets(error, settings)
             raise
+
+    def _nested(self) -> set[str]:
+        """Return the names of the fields of the environment and of the parts that can be chosen."""
+        from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS
+        from ba_torchrl.training.collectors.config import COLLECTORS
+
+        registries = {"algorithm": ALGORITHMS, "network": NETWORKS, "collector": COLLECTORS}
+        models = {"env": [EnvConfig]}
+        models |= {name: [*map(known.entry, known)] for name, known in registries.items()}
+        return {
+            each
+            for name in models.keys() & self.fields
+            for model in models[name]
+            for each in flat({name: defaults_of(model)})
+        }
 
     def config_names(self, further: str | None = None) -> list[str]:
         """Return the names that ``--config-name`` takes."""
@@ -180,7 +198,8 @@ class Command:
     def _check_names(self, names: Iterable[str]) -> None:
         for name in names:
             if name not in self.fields:
-                raise UnknownNameError("setting", name, self.fields)
+                meant = sorted(each for each in self._nested() if each.endswith(f".{name}"))
+                raise UnknownNameError("setting", name, [*self.fields, *meant])
 
     def _is_bare(self, word: str) -> bool:
         """Whether a word is the value of a positional field, such as a path with "=" or "~"."""
@@ -255,13 +274,25 @@ class Command:
         """Return the positional fields that words without "=" set."""
         names = (self.positional or "").split()
         if not names or len(words) > len(names) > 1:
-            raise ConfigError(f"{words[-1]!r} sets nothing; settings are FIELD=VALUE, see --help")
+            setting = shlex.join([self._setting_of(words[-1])])
+            raise ConfigError(f"{words[-1]!r} sets nothing; write {setting}, see --help")
         for name in names[: len(words)]:
             if name in given:
                 raise ConfigError(f"{name} is given twice")
         if len(words) > len(names):
+            if not takes_list(self.fields[names[0]]):
+                raise ConfigError(f"{words[1]!r} is one word too many: {names[0]} is {words[0]!r}")
             return {names[0]: list(words)}
         return dict(zip(names, words, strict=False))
+
+    def _setting_of(self, word: str) -> str:
+        """Return the setting that a word without "=" was probably meant to be."""
+        if "/" in word and "task" in self.fields:
+            return f"task={word}"
+        if word in self.fields:
+            return f"{word}=VALUE"
+        files = [] if self.config is None else config_dir().glob(f"*/{word}.yaml")
+        return next((f"{file.parent.name}={word}" for file in files), "FIELD=VALUE")
 
     @contextmanager
     def composed(self, arguments: Arguments) -> Iterator[DictConfig]:

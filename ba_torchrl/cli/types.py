@@ -66,7 +66,7 @@ def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
     """Check that a file can be written; its folder is created if needed."""
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
-        raise ConfigError(f"the name of the file ends in {' or '.join(suffixes)}, not {path.name}")
+        raise ConfigError(f"the name of the file must end in {' or '.join(suffixes)}")
     if len(os.fsencode(path.name)) > MAX_NAME_BYTES:
         raise ConfigError(f"cannot write to {path}: the name is too long")
     check_writable_folder(path.parent)

@@ -67,9 +67,9 @@ class Settings(EpisodeSettings):
     @model_validator(mode="after")
     def _check_result(self) -> Self:
         if self.result is not None and not self.policy.startswith(LEROBOT):
-            raise ValueError("result: of policies of LeRobot only; a run has its own")
+            raise ValueError("result is for policies of LeRobot; leave it out, a run has its own")
         if self.result is not None and self.seed is not None:
-            raise ValueError("result: has the episodes of the protocol; leave out seed")
+            raise ValueError("result is of the protocol's episodes; leave out seed")
         return self
 
 

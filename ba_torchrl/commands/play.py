@@ -67,7 +67,7 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
     """Return the environment and the policy that acts, None for random actions."""
     is_loaded = settings.policy not in ("expert", "random")
     if settings.task is None and (not is_loaded or settings.policy == "trained"):
-        raise ConfigError(f"task is missing: policy={settings.policy} acts in any, see --help")
+        raise ConfigError("task is missing: ba-torchrl play TASK; see --help")
     if not is_loaded:
         is_expert = settings.policy == "expert"
         resolved = resolve_env(settings.task, {**settings.env, "expert": is_expert})
@@ -92,7 +92,8 @@ def _trained(settings: Settings) -> TrainedPolicy:
         return load_policy(settings.task if settings.policy == "trained" else settings.policy)
     except UnknownNameError as error:
         known = ("expert", "random", "trained", *error.known)
-        raise UnknownNameError(error.kind, error.name, known, error.hint) from None
+        hint = f"; others are expert, random and trained{error.hint}"
+        raise UnknownNameError(error.kind, error.name, known, hint) from None
 
 
 COMMAND = Command(main, Settings, positional="task")

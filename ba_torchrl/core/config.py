@@ -5,8 +5,9 @@ from __future__ import annotations
 import ast
 import inspect
 import os
+import re
 import sys
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from itertools import pairwise
 from numbers import Real
@@ -187,7 +188,7 @@ def explain(
 ) -> SettingsError:
     """Return pydantic's errors of a model as one `SettingsError` that says what is allowed;
     arguments as for `parse`."""
-    problems = []
+    problems, alternatives = [], []
     for item in error.errors():
         if _is_inner(item):
             continue
@@ -206,19 +207,84 @@ def explain(
         elif kind in ("union_tag_not_found", "model_attributes_type") and parts:
             text = f"{field}.name is missing; known: {', '.join(parts)}"
         else:
-            message = item["msg"].removeprefix("Value error, ")
-            if kind == "tuple_type":
-                message = "Input should be a list"
-            given = repr(item["input"])
-            is_short = names and len(given) < 80 and str(item["input"]) not in message
-            text = f"{field}: {message}" + (f" (got {given})" if is_short else "")
+            text = f"{field}: {_rule(item)}" if names else _rule(item)
+            if len(names) < len([step for step in item["loc"] if step not in parts]):
+                alternatives.append(len(problems))
         problems.append((field, text))
-    return SettingsError(what, name, problems)
+    return SettingsError(what, name, _joined(problems, alternatives))
+
+
+def _joined(problems: list[tuple[str, str]], alternatives: Sequence[int]) -> list[tuple[str, str]]:
+    """Return problems in which those of the alternatives of one field are one; of a field and of
+    its items, those of the items."""
+    out, joined = [], dict[str, str]()
+    for number, (field, text) in enumerate(problems):
+        if number not in alternatives:
+            out.append((field, text))
+        elif field in joined:
+            first, other = joined[field].partition(" (got ")[0], text.removeprefix(f"{field}: ")
+            joined[field] = f"{first}, or {other.removeprefix('must be ')}"
+        else:
+            joined[field] = text
+    deepest = {f: t for f, t in joined.items() if not any(o.startswith(f"{f}.") for o in joined)}
+    return [*out, *deepest.items()]
+
+
+RULES = {
+    "missing": "is missing",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "float_type": "must be a number",
+    "finite_number": "must be a finite number",
+    "bool_type": "must be true or false",
+    "string_type": "must be text",
+    "string_too_short": "must not be empty",
+    "tuple_type": "must be a list",
+    "list_type": "must be a list",
+    "too_short": "must have at least {min_length} items",
+    "dict_type": "must be names with values, such as {{name: value}}",
+    "model_type": "must be names with values, such as {{name: value}}",
+    "model_attributes_type": "must be names with values, such as {{name: value}}",
+    "literal_error": "must be {expected}",
+    "greater_than": "must be greater than {gt}",
+    "greater_than_equal": "must be at least {ge}",
+    "less_than": "must be less than {lt}",
+    "less_than_equal": "must be at most {le}",
+}
+"""What pydantic's types of errors ask for."""
+
+
+def _short(bound: Any) -> Any:
+    return int(bound) if isinstance(bound, float) and bound.is_integer() else bound
+
+
+def _rule(item: Mapping[str, Any]) -> str:
+    """Return what a value must be, and what it is if that is short."""
+    kind, value = item["type"], item["input"]
+    given = repr(value)
+    if kind in RULES:
+        message = RULES[kind].format(**{k: _short(v) for k, v in item.get("ctx", {}).items()})
+        is_named = kind == "missing"
+    else:
+        message = item["msg"].removeprefix("Value error, ")
+        is_named = not item["loc"] or str(value) in message
+    if is_named or len(given) >= 80:
+        return message
+    if kind == "int_type" and isinstance(value, float) and value.is_integer():
+        given += f"; write {value:.0f}"
+    return f"{message} (got {given})"
 
 
 def _is_inner(item: Mapping[str, Any]) -> bool:
     """Whether one of pydantic's errors is an `InnerError`."""
     return isinstance(item.get("ctx", {}).get("error"), InnerError)
+
+
+_ALTERNATIVE = re.compile(
+    r"(constrained|function|lax|chain|json|is|nullable)[-\w\[\]().]*|int|float|str|bool|none"
+    r"|(list|tuple|dict|set|literal)\[.*\]"
+)
+"""Pydantic's names of the alternatives of a field."""
 
 
 def _place(model: Any, loc: Iterable[Any]) -> tuple[list[str], Any, Mapping[str, Any]]:
@@ -229,6 +295,8 @@ def _place(model: Any, loc: Iterable[Any]) -> tuple[list[str], Any, Mapping[str,
     for step in loc:
         if step in parts:  # pydantic's name for the choice
             model = parts[step]
+            continue
+        if model is None and isinstance(step, str) and _ALTERNATIVE.fullmatch(step):
             continue
         names.append(str(step))
         owner, field = model, model.model_fields.get(step) if model else None
@@ -305,7 +373,7 @@ class Chosen:
         if isinstance(values, self.registry.base):
             return values
         if not isinstance(values, Mapping):
-            raise ValueError("Input should be a valid dictionary")
+            raise ValueError(RULES["dict_type"].format())
         try:
             return choose(self.registry, values)
         except ConfigError as error:

@@ -12,8 +12,13 @@ from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, requires
 from typing import Any, get_args
 
-_LISTED_BY = {"task": "`ba-torchrl tasks` and ba_torchrl.list_tasks() list them"}
+_LISTED_BY = {
+    "task": "`ba-torchrl tasks` and ba_torchrl.list_tasks() list them",
+    "policy": "`ba-torchrl leaderboard` lists the policies that the package ships",
+}
 """By kind of name, what is written in place of many names."""
+_MANY = 20
+"""Number of known names that are not listed beside the nearest one."""
 
 
 class ConfigError(ValueError):
@@ -29,11 +34,15 @@ class UnknownNameError(ConfigError, KeyError):
         name: as it was given. Of a dotted path, the last part is compared.
         known: the names that are.
         hint: end of the message.
+        otherwise: further end of the message if no known name is similar.
     """
 
-    def __init__(self, kind: str, name: object, known: Iterable[str], hint: str = "") -> None:
-        self.kind, self.name, self.known, self.hint = kind, name, list(known), hint
-        super().__init__(kind, name, self.known, hint)
+    def __init__(
+        self, kind: str, name: object, known: Iterable[str], hint: str = "", otherwise: str = ""
+    ) -> None:
+        self.kind, self.name, self.known = kind, name, list(known)
+        self.hint, self.otherwise = hint, otherwise
+        super().__init__(kind, name, self.known, hint, otherwise)
 
     def __str__(self) -> str:
         last = str(self.name).rpartition(".")[2]
@@ -42,7 +51,10 @@ class UnknownNameError(ConfigError, KeyError):
         close = close or self._nearest(last)
         meant = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
         known = _LISTED_BY.get(self.kind, f"Known: {', '.join(self.known) or 'none'}")
-        return f"unknown {self.kind} {self.name!r}.{meant} {known}{self.hint}"
+        if close and len(self.known) > _MANY and self.kind not in _LISTED_BY:
+            return f"unknown {self.kind} {self.name!r}.{meant}{self.hint}"
+        end = self.hint if close else self.hint + self.otherwise
+        return f"unknown {self.kind} {self.name!r}.{meant} {known}{end}"
 
     def _nearest(self, name: str) -> list[str]:
         """Return the most similar known name, of several the one with most letters in place."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import os
 import platform
+import re
+import textwrap
 from pathlib import Path
 from typing import Any
 
 import torch
+
+from ba_torchrl.core.errors import ConfigError
 
 INSTRUCTIONS = {"amx_bf16": "AMX", "avx512_f": "AVX-512", "avx2": "AVX2", "sve": "SVE"}
 """Names of instruction sets by PyTorch's name of the capability, widest first."""
@@ -89,3 +93,25 @@ def _memory_gb() -> float | None:
     if not hasattr(os, "sysconf") or "SC_PHYS_PAGES" not in os.sysconf_names:
         return None
     return round(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") / 1e9, 1)
+
+
+def as_device(name: torch.device | str | int) -> torch.device:
+    """Return a device named as in torch; "auto" for a GPU if there is one, else the CPU."""
+    if name == "auto":
+        name = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(name)
+
+
+def usable_device(name: torch.device | str | int) -> torch.device:
+    """Return the device of a name of `as_device` that can compute; `ConfigError` if it cannot."""
+    fix = "use device=cpu or device=auto"
+    try:
+        device = as_device(name)
+    except (RuntimeError, TypeError):
+        raise ConfigError(f"device: {fix}; torch knows no device {name!r}") from None
+    try:
+        torch.zeros(1, device=device).item()
+    except (RuntimeError, AssertionError, NotImplementedError) as error:
+        reason = textwrap.shorten(re.split(r"\.\s", str(error))[0], 100)
+        raise ConfigError(f"device: {fix}; {str(name)!r} cannot compute here: {reason}") from None
+    return device

@@ -124,7 +124,7 @@ class Registry(Generic[T]):
                 ". To use your own, import its module first (commands: 'plugins=[module]'; "
                 "worker processes: register_modules=[module])"
             )
-            raise UnknownNameError(self.kind, name, self, hint) from None
+            raise UnknownNameError(self.kind, name, self, otherwise=hint) from None
 
     def __contains__(self, name: object) -> bool:
         self._scan()

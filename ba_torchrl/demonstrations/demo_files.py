@@ -215,8 +215,11 @@ def read_metadata(path: Path) -> dict[str, Any]:
     """Return what a folder that `save_demonstrations` wrote says of its episodes."""
     try:
         metadata = read_json(path / METADATA_FILE)
+    except FileNotFoundError:
+        raise ConfigError(f"no demonstrations at {path}: there is no {METADATA_FILE}") from None
     except (OSError, ValueError, RecursionError) as error:
-        raise ConfigError(f"no demonstrations at {path}: {error}") from None
+        reason = f"{METADATA_FILE} cannot be read: {error}"
+        raise ConfigError(f"no demonstrations at {path}: {reason}") from None
     verify_checksums(path)
     if isinstance(metadata, dict) and metadata.get("format") != _FORMAT:
         raise ConfigError(

@@ -16,6 +16,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
+from ba_torchrl.core.hardware import usable_device
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.checks import ChecksPolicy, check_entries, check_seed, checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
@@ -66,6 +67,7 @@ class _MadeByTask(type(EnvBase)):
         device: torch.device | str | int | None = None,
         **config: Any,
     ) -> BulletArmEnv:
+        place = None if device is None else usable_device(device)
         if cls is BulletArmEnv:
             resolved = resolve_env(task, config)
             env = resolve_name(resolved.control.env)(resolved)
@@ -75,7 +77,7 @@ class _MadeByTask(type(EnvBase)):
             )
         else:
             env = super().__call__(task, **config)
-        return env if device is None else env.to(device)
+        return env if place is None else env.to(place)
 
 
 class BulletArmEnv(ChecksPolicy, EnvBase, metaclass=_MadeByTask):

@@ -21,6 +21,7 @@ from pydantic import (
 
 from ba_torchrl.algorithms.config import ALGORITHMS, NETWORKS, LearnerConfig, NetworkConfig
 from ba_torchrl.core.config import (
+    RULES,
     Chosen,
     CompileMode,
     InnerError,
@@ -174,7 +175,9 @@ class ExperimentConfig(WorkerOptions):
     @property
     def torch_device(self) -> torch.device:
         """The learner's device."""
-        return _as_device(self.device)
+        from ba_torchrl.core.hardware import as_device
+
+        return as_device(self.device)
 
     @property
     def folder(self) -> Path:
@@ -231,6 +234,8 @@ class ExperimentConfig(WorkerOptions):
                 f"logger: {config.logger!r} needs a package that is not installed: "
                 + install_command(config.logger)
             )
+        from ba_torchrl.core.hardware import usable_device
+
         usable_device(config.device)
         return config.model_copy(update={"plugins": config._all_plugins()})
 
@@ -247,7 +252,7 @@ class ExperimentConfig(WorkerOptions):
     @classmethod
     def _resolve(cls, values: Any, info: ValidationInfo) -> ResolvedEnv | None:
         if not isinstance(values, Mapping):
-            raise ValueError("Input should be a valid dictionary")
+            raise ValueError(RULES["dict_type"].format())
         if "task" not in info.data:
             return None  # the task's error is the one to report
         try:
@@ -313,35 +318,13 @@ class ExperimentConfig(WorkerOptions):
                 mapping=self.demonstrations_mapping,
             )
         elif self.demonstrations_mapping is not None:
-            raise ConfigError("demonstrations_mapping: set demonstrations_path, whose it is")
+            raise ConfigError("demonstrations_mapping is for demonstrations_path; set both")
 
 
 def _blank(model: type[ExperimentConfig], plugins: Collection[str]) -> ExperimentConfig:
     """Import plugins, and return what gets its fields from a pickle."""
     load_plugins(plugins)
     return model.__new__(model)
-
-
-def usable_device(name: str) -> torch.device:
-    """Return a device that can compute, named as in torch; "auto" for a GPU if there is one, else
-    the CPU. `ConfigError` if it does not exist."""
-    import torch
-
-    try:
-        device = _as_device(name)
-        torch.zeros(1, device=device).item()
-    except (RuntimeError, AssertionError, NotImplementedError) as error:
-        reason = str(error).splitlines()[0]
-        raise ConfigError(f"device: use device=cpu or device=auto ({reason})") from None
-    return device
-
-
-def _as_device(name: str) -> torch.device:
-    import torch
-
-    if name == "auto":
-        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
-    return torch.device(name)
 
 
 _REGISTRIES = {"network": NETWORKS, "algorithm": ALGORITHMS, "collector": COLLECTORS}

@@ -25,7 +25,7 @@ from ba_torchrl.core.errors import (
     install_command,
 )
 from ba_torchrl.core.files import json_bytes
-from ba_torchrl.core.hardware import hardware
+from ba_torchrl.core.hardware import hardware, usable_device
 from ba_torchrl.demonstrations.formats.base import Card, read_card
 from ba_torchrl.envs.description import describe
 from ba_torchrl.envs.factory import make
@@ -33,7 +33,6 @@ from ba_torchrl.envs.lerobot import IMAGES, PolicyView
 from ba_torchrl.envs.settings import resolve_env
 from ba_torchrl.record.results import PolicyTest, RunResult, now, versions
 from ba_torchrl.tasks.base import versions_of
-from ba_torchrl.training.config import usable_device
 from ba_torchrl.training.policy import EnvPolicy
 from ba_torchrl.training.protocol import PROTOCOL, count_parameters
 

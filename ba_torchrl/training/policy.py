@@ -29,7 +29,7 @@ from ba_torchrl.core import keys
 from ba_torchrl.core.config import expanded
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError, UnknownNameError, check_choice
 from ba_torchrl.core.files import atomic_file, errors_naming, header_texts, json_bytes
-from ba_torchrl.core.hardware import hardware
+from ba_torchrl.core.hardware import hardware, usable_device
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.factory import make
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -266,16 +266,18 @@ def load_policy(
         >>> env.close()
     """
     check_choice("which", which, Which)
-    changes = {**_OF_TRAINING, "device": str(device), **changes}
+    changes = {**_OF_TRAINING, "device": str(usable_device(device)), **changes}
     if str(source) in TASKS:
         path = shipped_file(str(source))
         if not path.exists():
-            known = ", ".join(shipped_policies()) or "none"
-            raise ConfigError(f"no trained policy of {source} is shipped; those that are: {known}")
+            raise ConfigError(
+                f"the package ships no policy of {source}; `ba-torchrl leaderboard` lists those "
+                "that it ships"
+            )
     else:
         path = Path(expanded(source))
         if not path.exists():
-            hint = f"; and there is no run folder and no file of a policy {source}"
+            hint = f", and there is no run folder and no file {source}"
             raise UnknownNameError("policy", str(source), shipped_policies(), hint)
     if path.suffix != POLICY_SUFFIX or path.is_dir():
         checkpoint = find_checkpoint(path, which)

@@ -200,8 +200,9 @@ def name_presets(error: ConfigError, settings: DictConfig) -> None:
         return
     fields = {field.split(".")[0] for field, _ in error.problems}
     for group in _PARTS:
-        if group in fields and choices.get(group) not in (None, "uniform", "none"):
-            hint = f"{group}={choices[group]} sets it; this algorithm cannot have it"
+        chosen = choices.get(group)
+        if group in fields and chosen in preset_names(group) and chosen not in ("uniform", "none"):
+            hint = f"{group}={chosen} sets it; this algorithm cannot have it"
             error.problems.append((group, hint))
 
 
@@ -218,4 +219,6 @@ def _explained(error: HydraException) -> ConfigError:
     if isinstance(error, MissingConfigException) and error.missing_cfg_file is not None:
         group, _, name = error.missing_cfg_file.rpartition("/")
         return UnknownNameError(group, name, error.options or ())
+    if match := re.match("Could not override '([^']+)'", first):
+        return ConfigError(f"{match[1]} is no setting of this command; see --help")
     return ConfigError(first)

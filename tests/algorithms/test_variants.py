@@ -307,7 +307,7 @@ def test_rotated_copies_are_stored_or_transitions_rotated_when_sampled():
             {"views": {"name": "crop", "pixels": 2}},
             r"'views.pixels'. Known: name, size, target_views, views \(views.name=shift has it\)",
         ),
-        ({"views": {"name": "shift", "pixels": 0}}, "  views.pixels: Input should be greater"),
+        ({"views": {"name": "shift", "pixels": 0}}, "  views.pixels: must be"),
     ],
 )
 def test_options_that_do_not_go_together_are_refused(changes, message):

@@ -22,9 +22,9 @@ from ba_torchrl.tasks.base import TASKS
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"max_steps": "10"}, "max_steps: .*integer"),
-        ({"max_steps": 0}, "max_steps: .*greater"),
-        ({"random_orientation": 1}, "random_orientation: .*boolean"),
+        ({"max_steps": "10"}, "max_steps: must be a whole number .got '10'"),
+        ({"max_steps": 0}, "max_steps: must be at least 1"),
+        ({"random_orientation": 1}, "random_orientation: must be true or false"),
         ({"obs_size": 4}, "obs_size"),
         ({"workspace": [0.3, 0.6]}, "three .low, high. pairs"),
         ({"workspace": [[0.6, 0.3], [-0.1, 0.1], [0, 1]]}, "low < high"),
@@ -39,7 +39,7 @@ from ba_torchrl.tasks.base import TASKS
         ({"object_scale_range": True}, "a number or a"),
         ({"workspace_check": "box"}, "bounding_box"),
         ({"dpos": 0.0}, "dpos"),
-        ({"observations": "proprio"}, "observations: Input should be a list"),
+        ({"observations": "proprio"}, "observations: must be a list"),
     ],
 )
 def test_wrong_values_say_what_is_allowed(values, message):
@@ -103,7 +103,7 @@ PICKING = "close_loop/block_picking"
 @pytest.mark.parametrize(
     ("settings", "message"),
     [
-        ({"max_step": 3}, "Did you mean 'max_steps'.* random_orientation"),
+        ({"max_step": 3}, r"Did you mean 'max_steps'\?$"),
         ({"task": "close_loop/block_pickin"}, PICKING),
         ({"robot": "baxter"}, "Known: .*kuka"),
         *(

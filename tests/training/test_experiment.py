@@ -212,9 +212,9 @@ FERM = {
     ("changes", "message"),
     [
         ({"task": "close_loop/flying"}, "unknown task 'close_loop/flying'"),
-        ({"task": 3}, "task: Input should be a valid string"),
+        ({"task": 3}, "task: must be text"),
         ({"env": {"obs_sise": 64}}, "Did you mean 'obs_size'"),
-        ({"env": 3}, "env: Input should be a valid dictionary"),
+        ({"env": 3}, "env: must be names with values"),
         ({"env": {"seed": 3}}, "set by the experiment"),
         ({"env": {"obs_type": "vec"}}, "obs_type"),
         ({"algorithm": {"name": "ppo"}}, "unknown algorithm 'ppo'.*sac"),
@@ -236,7 +236,7 @@ FERM = {
             {"demonstrations": 0, **NO_PRETRAINING, "demonstrations_path": "/a"},
             "set demonstrations",
         ),
-        ({"demonstrations_mapping": "a.yaml"}, "demonstrations_mapping: set demonstrations_path"),
+        ({"demonstrations_mapping": "a.yaml"}, "demonstrations_mapping is for demonstrations_path"),
         (
             {"algorithm": FERM, "demonstrations": 0, **NO_PRETRAINING},
             "an update before the first environment step needs demonstrations",

@@ -282,16 +282,16 @@ def test_a_checkpoint_is_loaded_without_a_replay_and_refused_if_it_is_too_small(
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"network": {"group_order": 100_000}}, "group_order: Input should be less than or equal"),
-        ({"network": {"n_hidden": 10**9}}, "n_hidden: Input should be less than or equal"),
+        ({"network": {"group_order": 100_000}}, "group_order: must be at most"),
+        ({"network": {"n_hidden": 10**9}}, "n_hidden: must be at most"),
         ({"network": {"group_order": 32, "reflections": True}}, "group_order is at most 16 with"),
         (
             {"network": {"group_order": 32, "reflections": False, "n_hidden": 1024}},
             r"does not hold the weights of its settings, .* more than [\d,]+ parameters",
         ),
-        ({"env": {"obs_size": 10**6}}, "obs_size: Input should be less than or equal"),
-        ({"env": {"max_steps": 10**30}}, "max_steps: Input should be less than or equal"),
-        ({"algorithm": {"replay": {"name": "prioritized", "capacity": 10**12}}}, "capacity: Input"),
+        ({"env": {"obs_size": 10**6}}, "obs_size: must be at most"),
+        ({"env": {"max_steps": 10**30}}, "max_steps: must be at most"),
+        ({"algorithm": {"replay": {"name": "prioritized", "capacity": 10**12}}}, "capacity: must"),
     ],
 )
 def test_absurd_sizes_in_a_file_are_refused_before_a_network_is_built(tmp_path, changes, message):
@@ -305,7 +305,7 @@ def test_absurd_sizes_in_a_file_are_refused_before_a_network_is_built(tmp_path, 
 
 
 def test_what_is_no_policy_is_named(run, tmp_path):
-    with pytest.raises(ConfigError, match=r"is shipped; those that are: "):
+    with pytest.raises(ConfigError, match="ships no policy of"):
         ba_torchrl.load_policy("bump/box_palletizing")
     with pytest.raises(ConfigError, match="no run folder and no file"):
         ba_torchrl.load_policy(tmp_path / "none")

@@ -54,9 +54,10 @@ class WorkersConfig(CollectorConfig):
     def check(self, num_envs: int) -> None:
         """Raise `ConfigError` unless the workers can share the environments equally."""
         if num_envs % self.workers:
+            envs = -(-num_envs // self.workers) * self.workers
             raise ConfigError(
                 f"collector.workers: {self.workers} workers cannot share num_envs={num_envs} "
-                "environments equally"
+                f"environments equally; set num_envs={envs}"
             )
 
 
