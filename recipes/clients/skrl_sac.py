@@ -1,7 +1,7 @@
 """skrl: SAC learns to reach a block from its state.
 
 pip install "skrl[torch]==2.1.1"
-python recipes/clients/skrl_sac.py --steps 4000
+python recipes/clients/skrl_sac.py --steps 6000
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from skrl.utils import set_seed
 from skrl.utils.model_instantiators.torch import deterministic_model, gaussian_model
 
 parser = argparse.ArgumentParser()
-parser.add_argument("--steps", type=int, default=4000)
+parser.add_argument("--steps", type=int, default=6000)
 options = parser.parse_args()
 set_seed(0)
 ENV = "BulletArm/CloseLoopBlockReaching-State-v0"
