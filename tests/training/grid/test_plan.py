@@ -84,7 +84,7 @@ def test_skip_leaves_out_matching_runs(tmp_path):
         ({"seeds": 0}, "seeds"),
         ({"seeds": 10**11}, "seeds"),
         ({"seeds": [1, 1]}, "names one twice"),
-        ({"seeds": [2**52]}, r"seeds.*less than or equal to 4503599627370495"),
+        ({"seeds": [2**52]}, "seeds.*must be at most 4503599627370495"),
         ({"networks": ["cnn", "cnn"]}, "names one twice"),
         ({"sedes": 3}, "Did you mean 'seeds'"),
         ({"common": {"total_update": 5}}, "Did you mean 'total_updates'"),
