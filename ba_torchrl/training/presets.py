@@ -35,13 +35,26 @@ _PARTS = ("replay", "rotation")
 _plugin_presets: dict[str, set[str]] = {}
 """By group, the entries of plugins, which are presets."""
 
+_search_path: list[str] = []
+"""Override of Hydra that names a further folder of presets; empty without one."""
+
 
 @contextmanager
-def started(folder: Path) -> Iterator[None]:
-    """Context in which `preset` reads the presets of a folder, such as ``configs``."""
+def started(folder: Path, further: Path | None = None) -> Iterator[None]:
+    """Context in which `preset` reads the presets of a folder, such as ``configs``, and of a
+    further one."""
     register()
-    with initialize_config_dir(str(folder), version_base="1.3", job_name="ba-torchrl"):
-        yield
+    before = [*_search_path]
+    if further is not None:
+        path = re.sub(
+            r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", "\\'"), f"file://{further}"
+        )
+        _search_path[:] = [f"hydra.searchpath=['{path}']"]
+    try:
+        with initialize_config_dir(str(folder), version_base="1.3", job_name="ba-torchrl"):
+            yield
+    finally:
+        _search_path[:] = before
 
 
 @contextmanager
@@ -64,16 +77,11 @@ def composed(
     Raises:
         ConfigError: there is no such preset, or it cannot be read.
     """
-    overrides = list(overrides)
-    if further is not None:
-        other = further.resolve()
-        if (other / f"{name}.yaml").exists():  # Hydra reads it before it knows further folders
-            folder, other = other, folder
-        path = re.sub(
-            r"(\\*)('|$)", lambda m: 2 * m[1] + m[2].replace("'", "\\'"), f"file://{other}"
-        )
-        overrides.append(f"hydra.searchpath=['{path}']")
-    with started(folder):
+    other = None if further is None else further.resolve()
+    if other is not None and (other / f"{name}.yaml").exists():
+        folder, other = other, folder  # Hydra reads the file before it knows further folders
+    with started(folder, other):
+        overrides = [*overrides, *_search_path]
         try:
             settings = compose(name, overrides=overrides, return_hydra_config=True)
         except HydraException as error:
@@ -178,13 +186,14 @@ def preset(group: str, name: str) -> dict[str, Any]:
             overrides.append(f"+{other}={parts.pop(0)}")
     if not first or parts:
         raise UnknownNameError(group, name, known)
-    values = OmegaConf.to_container(compose(overrides=overrides)[group], resolve=True)
+    found = compose(overrides=[*overrides, *_search_path])
+    values = OmegaConf.to_container(found[group], resolve=True)
     return {**values, "imitation": {"name": "none"}} if has_no_behaviour_term else values
 
 
 def preset_names(group: str) -> list[str]:
     """Return the names of a group's presets; Hydra must have been `started`."""
-    files = GlobalHydra.instance().config_loader().get_group_options(group)
+    files = GlobalHydra.instance().config_loader().get_group_options(group, overrides=_search_path)
     return sorted({*files, *_plugin_presets.get(group, ())})
 
 

@@ -33,6 +33,7 @@ LONG = 300 * "n"
 REFUSED = [
     ("train", "run_dir=file", "it is not a folder"),
     ("train", "run_dir=/dev/full/x", "cannot write to "),
+    ("train", "demonstrations_source=deconstruction", "deconstruction has no meaning for close_lo"),
     ("benchmark", "only=9999", "only: must be a number from 0 to "),
     ("benchmark", "folder=file", "it is not a folder"),
     ("collect", "foo=1", "unknown setting 'foo'. Known: "),

@@ -11,11 +11,12 @@ from omegaconf import OmegaConf
 
 from ba_torchrl import cli
 from ba_torchrl.cli.command import Arguments
-from ba_torchrl.commands import train
+from ba_torchrl.commands import benchmark, train
 from ba_torchrl.core.config import descriptions
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.training.checkpoint import write_config
 from ba_torchrl.training.config import ExperimentConfig
+from ba_torchrl.training.presets import preset
 from tests.fresh import run_script
 from tests.recipes import load_recipe
 from tests.test_pages import unquoted
@@ -251,9 +252,14 @@ def test_an_own_configuration_in_a_further_folder(tmp_path, capsys, monkeypatch)
     assert "  seed=7" in capsys.readouterr().out
     (tmp_path / "my_grid.yaml").write_text("defaults: [benchmark, _self_]\nseeds: 9\n")
     cli.main(["benchmark", "--config-dir", ".", "--config-name", "my_grid", "--help"])
-    assert "  seeds=9" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "  seeds=9" in out
+    assert "launcher=local | ray" in out
+    words = ["--config-dir", ".", "--config-name", "my_grid"]
+    with benchmark.COMMAND.composed(benchmark.COMMAND.read(words)):
+        assert preset("network", "cnn")["name"] == "cnn"
     (tmp_path / "my_grid.yaml").write_text("defaults: [benchmark, _self_]\nsedes: 9\n")
-    line = refused(["benchmark", "--config-dir", ".", "--config-name", "my_grid"], capsys)
+    line = refused(["benchmark", *words], capsys)
     assert "unknown setting 'sedes'. Did you mean 'seeds'" in line
 
 
