@@ -10,11 +10,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import torch
-from pydantic import Field, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, model_validator
 from torchrl.data import NonTensor, TensorSpec, Unbounded
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.config import StrictModel
+from ba_torchrl.core.config import StrictModel, parse
 from ba_torchrl.core.errors import ConfigError, MissingPackageError, install_command
 from ba_torchrl.demonstrations.formats.base import (
     RESULTS,
@@ -76,20 +76,13 @@ class EntrySource(StrictModel):
             raise ConfigError(f"{self.source}, {found.shape}: {error}") from None
 
 
-_SOURCES = TypeAdapter(dict[str, EntrySource])
-
-
 def _sources(mapping: str | Path | Mapping[str, Any]) -> dict[str, EntrySource]:
     """Return the source of each key, of a mapping that is given as a YAML file or as its values."""
     is_file = not isinstance(mapping, Mapping)
     what, values = (mapping, _read_yaml(Path(mapping))) if is_file else ("mapping", mapping)
     if not isinstance(values, Mapping):
         raise ConfigError(f"{what}: must map keys to names in the file, got {values!r}")
-    try:
-        return _SOURCES.validate_python(values)
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise ConfigError(f"{what}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
+    return {str(key): parse(EntrySource, value, f"{what}: {key}") for key, value in values.items()}
 
 
 def _read_yaml(path: Path) -> Any:
