@@ -1,6 +1,7 @@
 """imitation: DAgger, whose labels are the expert's, and GAIL on its episodes.
 
-pip install imitation==1.0.1
+pip install stable-baselines3==2.9.2 datasets huggingface-sb3 rich sacred scikit-learn tensorboard
+pip install --no-deps imitation==1.0.1 seals==0.2.1
 python recipes/clients/imitation_dagger.py dagger --steps 400
 """
 
