@@ -6,6 +6,7 @@ import os
 import platform
 import re
 import textwrap
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -102,15 +103,27 @@ def as_device(name: torch.device | str | int) -> torch.device:
     return torch.device(name)
 
 
+def existing_device(name: torch.device | str | int) -> torch.device:
+    """Return the device of a name of `as_device` that can hold tensors; `ConfigError` if it cannot.
+
+    The tensors of "meta" have no values.
+    """
+    return _checked(name, lambda device: torch.zeros(1, device=device))
+
+
 def usable_device(name: torch.device | str | int) -> torch.device:
     """Return the device of a name of `as_device` that can compute; `ConfigError` if it cannot."""
+    return _checked(name, lambda device: torch.zeros(1, device=device).item())
+
+
+def _checked(name: torch.device | str | int, use: Callable[[torch.device], object]) -> torch.device:
     fix = "use device=cpu or device=auto"
     try:
         device = as_device(name)
     except (RuntimeError, TypeError):
         raise ConfigError(f"device: {fix}; torch knows no device {name!r}") from None
     try:
-        torch.zeros(1, device=device).item()
+        use(device)
     except (RuntimeError, AssertionError, NotImplementedError) as error:
         reason = textwrap.shorten(re.split(r"\.\s", str(error))[0], 100)
         raise ConfigError(f"device: {fix}; {str(name)!r} cannot compute here: {reason}") from None

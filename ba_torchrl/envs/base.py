@@ -16,7 +16,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError, PlacementError, SimulationError
-from ba_torchrl.core.hardware import usable_device
+from ba_torchrl.core.hardware import existing_device
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.envs.checks import ChecksPolicy, check_entries, check_seed, checked_action
 from ba_torchrl.envs.episodes import EnvState, Episodes, evaluate_at_rest
@@ -67,7 +67,7 @@ class _MadeByTask(type(EnvBase)):
         device: torch.device | str | int | None = None,
         **config: Any,
     ) -> BulletArmEnv:
-        place = None if device is None else usable_device(device)
+        place = None if device is None else existing_device(device)
         if cls is BulletArmEnv:
             resolved = resolve_env(task, config)
             env = resolve_name(resolved.control.env)(resolved)

@@ -12,7 +12,7 @@ from torchrl.envs import EnvBase
 
 from ba_torchrl.core.config import WorkerOptions, parse
 from ba_torchrl.core.errors import ConfigError
-from ba_torchrl.core.hardware import usable_device
+from ba_torchrl.core.hardware import existing_device
 from ba_torchrl.core.plugins import module_names
 from ba_torchrl.envs.base import BulletArmEnv
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -73,7 +73,7 @@ def make_vector_env(
         torch.Size([2, 3, 5])
         >>> env.close()
     """
-    place = None if device is None else usable_device(device)
+    place = None if device is None else existing_device(device)
     of_workers = {name: options.pop(name) for name in WorkerOptions.model_fields if name in options}
     if not isinstance(workers, WorkerOptions | None):
         raise ConfigError(f"workers: must be WorkerOptions, got {workers!r}")
