@@ -9,6 +9,7 @@ PLACE = "open_loop/block_stacking"
 PRESETS = {
     ("algorithm", "sac"): {"name": "sac", "imitation": {"name": "none"}},
     ("algorithm", "sacfd"): {"name": "sac"},
+    ("algorithm", "per"): {"name": "sac", "replay": {"name": "prioritized", "expert_bonus": 2.0}},
     ("network", "cnn"): {"name": "cnn"},
     ("network", "small"): {"name": "cnn", "width": 0.25},
 }

@@ -331,20 +331,24 @@ def test_a_killed_run_is_resumed_in_a_new_process(tmp_path):
 
 def test_a_run_ends_with_its_grid(tmp_path):
     """It would learn on, unseen, if the grid is killed or its terminal is closed."""
-    config, _ = os.pipe()  # which the run waits for
+    config, open_end = os.pipe()  # which the run waits for
     ended, end = os.pipe()
     start = f"""
 import os, subprocess
 worker = {[*jobs.WORKER, "run"]} + [str(os.getpid())]
-subprocess.Popen(worker, stdin={config}, pass_fds=[{end}]).wait()
+run = subprocess.Popen(worker, stdin={config}, pass_fds=[{end}])
+print(run.pid, flush=True)
+run.wait()
 """
-    grid = subprocess.Popen([sys.executable, "-c", start], pass_fds=[config, end])
-    os.close(end)
-    time.sleep(0.5)  # the run has started, or starts without a grid
-    grid.kill()
-    grid.wait()
+    command = [sys.executable, "-c", start]
+    with subprocess.Popen(command, pass_fds=[config, end], stdout=subprocess.PIPE) as grid:
+        os.close(end)
+        assert int(grid.stdout.readline())  # the run has started
+        grid.kill()
     assert select.select([ended], [], [], 60)[0]  # its last holder has ended
     assert os.read(ended, 1) == b""
+    for pipe in (config, open_end, ended):
+        os.close(pipe)
 
 
 @pytest.mark.usefixtures("cached_presets")

@@ -52,6 +52,19 @@ def test_the_more_specific_override_wins(tmp_path):
     assert PRESETS["network", "small"] == {"name": "cnn", "width": 0.25}
 
 
+def test_another_part_of_one_task_drops_the_fields_that_only_the_preset_had(tmp_path):
+    own = {"algorithm": {"replay": {"name": "uniform"}}}
+    runs = planned(
+        tmp_path, seeds=1, tasks=[REACH, PICK], algorithms=["per"], per_task={REACH: own}
+    )
+    replays = {run.task: run.algorithm.replay for run in runs}
+    assert replays[PICK].expert_bonus == 2.0
+    assert replays[REACH].name == "uniform"
+    own["algorithm"]["replay"]["expert_bonus"] = 2.0  # the user's own are refused
+    with pytest.raises(ConfigError, match=r"unknown parameter 'replay\.expert_bonus'"):
+        planned(tmp_path, seeds=1, algorithms=["per"], per_task={REACH: own})
+
+
 def test_skip_leaves_out_matching_runs(tmp_path):
     runs = planned(
         tmp_path,
