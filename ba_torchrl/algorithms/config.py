@@ -38,6 +38,8 @@ class LearnerConfig(StrictModel):
     """Whether the policy collects transitions; if not, all updates are on the demonstrations."""
     is_compilable: ClassVar[bool] = True
     """Whether `Learner.compile` is possible."""
+    acting: ClassVar[frozenset[str]] = frozenset()
+    """Fields that a trained policy acts by and that do not affect learning."""
 
     optimizer: OptimizerConfig = OptimizerConfig()
     """Steps along the gradient."""

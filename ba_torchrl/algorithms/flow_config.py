@@ -26,6 +26,7 @@ class FlowConfig(LearnerConfig):
     controls: ClassVar[frozenset[Control]] = frozenset({"close_loop"})
     collects: ClassVar[bool] = False
     imitates: ClassVar[Imitation] = "expert"
+    acting: ClassVar[frozenset[str]] = frozenset({"executed", "steps"})
 
     rotation: Annotated[NoRotation | Sampled, Field(discriminator="name")] = NoRotation()
     """Of sampled transitions and their chunks about the z axis."""

@@ -108,6 +108,14 @@ class PluginSettings(StrictModel):
     """Modules outside the package that register tasks, robots, ...: [my_tasks]."""
 
 
+class ActingSettings(PluginSettings):
+    """Settings of a command that plays a policy."""
+
+    algorithm: dict[str, Any] = Field(default_factory=dict)
+    """Fields that a trained policy acts by, with other values than in its training: with flow and
+    flow_dagger, algorithm.executed and algorithm.steps."""
+
+
 class EnvSettings(PluginSettings):
     """Settings of a command that makes environments."""
 

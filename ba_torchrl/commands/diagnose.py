@@ -38,11 +38,10 @@ class Settings(PolicySettings):
 
 def main(settings: Settings) -> None:
     """Play episodes, compare the policy with the expert where it fails, and write the page."""
-    from ba_torchrl import load_policy
     from ba_torchrl.record.diagnosis import PAGE, write_diagnosis
     from ba_torchrl.testing.diagnosis import diagnose
 
-    policy = load_policy(settings.policy, settings.which, settings.device)
+    policy = settings.load()
     seeds = range(settings.seed, settings.seed + settings.episodes)
     folder = Path(settings.folder)
     with atomic_output(folder) as scratch:

@@ -2,6 +2,7 @@
 
 ba-torchrl evaluate runs/my-run episodes=100 video=my-run.mp4
 ba-torchrl evaluate runs/my-run which=latest
+ba-torchrl evaluate runs/my-run algorithm.executed=2     # of each chunk, in another number
 ba-torchrl evaluate close_loop/block_picking       # that which the package ships
 ba-torchrl evaluate policy=lerobot:outputs/act episodes=500 result=runs/act/seed0
 """
@@ -15,9 +16,9 @@ from typing_extensions import Self
 
 from ba_torchrl.cli.command import Command
 from ba_torchrl.cli.types import (
+    ActingSettings,
     Count,
     NewPath,
-    PluginSettings,
     Seed,
     Text,
     VectorSettings,
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from ba_torchrl.training.policy import TrainedPolicy
 
 
-class PolicySettings(PluginSettings):
+class PolicySettings(ActingSettings):
     """A policy."""
 
     policy: LocalPath
@@ -43,6 +44,12 @@ class PolicySettings(PluginSettings):
     """Of a run folder: the checkpoint with the best evaluation, or the latest."""
     device: Text = "auto"
     """Where the policy is computed, whatever device it was trained on."""
+
+    def load(self) -> TrainedPolicy:
+        """Load the policy."""
+        from ba_torchrl import load_policy
+
+        return load_policy(self.policy, self.which, self.device, self.algorithm)
 
 
 class EpisodeSettings(PolicySettings, VectorSettings):
@@ -70,12 +77,13 @@ class Settings(EpisodeSettings):
             raise ValueError("result is for policies of LeRobot; leave it out, a run has its own")
         if self.result is not None and self.seed is not None:
             raise ValueError("result is of the protocol's episodes; leave out seed")
+        if self.algorithm and self.policy.startswith(LEROBOT):
+            raise ValueError("algorithm is of policies of this package; leave it out")
         return self
 
 
 def main(settings: Settings) -> None:
     """Play greedy episodes with a policy."""
-    from ba_torchrl import load_policy
     from ba_torchrl.training.evaluation import record_episodes
     from ba_torchrl.training.lerobot_policy import load_lerobot, result_of
     from ba_torchrl.training.protocol import PROTOCOL
@@ -84,7 +92,7 @@ def main(settings: Settings) -> None:
     if settings.policy.startswith(LEROBOT):
         policy = load_lerobot(settings.policy.removeprefix(LEROBOT), settings.device)
     else:
-        policy = load_policy(settings.policy, settings.which, settings.device)
+        policy = settings.load()
     seed = FIRST_TEST_SEED if settings.seed is None else settings.seed
     found = play(policy, settings, seed)
     text = success_text(found.success_rate, found.episodes, policy.task)
@@ -96,7 +104,8 @@ def main(settings: Settings) -> None:
         other = "" if known.protocol == PROTOCOL else f", protocol {known.protocol}"
         episodes = f"{known.last.episodes} episodes{other}"
         print(f"  in file   {rate:.2f} ({low:.2f} to {high:.2f}) over {episodes}")
-    print(f"  policy    update {policy.updates}, {policy.source}")
+    changed = "".join(f", algorithm.{name}={value}" for name, value in settings.algorithm.items())
+    print(f"  policy    update {policy.updates}, {policy.source}{changed}")
     episodes = f"protocol {PROTOCOL}"
     if settings.seed is not None:
         episodes = f"seed {seed}, not those of the protocol"

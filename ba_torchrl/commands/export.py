@@ -32,10 +32,9 @@ class Settings(evaluate.EpisodeSettings):
 
 def main(settings: Settings) -> None:
     """Test the policy, and write it with the result."""
-    from ba_torchrl import load_policy
     from ba_torchrl.training import policy as policies
 
-    policy = load_policy(settings.policy, settings.which, settings.device)
+    policy = settings.load()
     path = Path(settings.path or f"{policy.task.replace('/', '_')}{POLICY_SUFFIX}")
     check_new(path)
     check_writable_file(path, suffixes=(POLICY_SUFFIX,))

@@ -12,7 +12,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 from ba_torchrl.cli.command import Command
-from ba_torchrl.cli.types import Count, EnvSettings, Fps, TaskId, VideoFile
+from ba_torchrl.cli.types import ActingSettings, Count, EnvSettings, Fps, TaskId, VideoFile
 from ba_torchrl.core.config import LEROBOT, LocalPath
 from ba_torchrl.core.errors import ConfigError, UnknownNameError
 from ba_torchrl.envs.settings import ResolvedEnv, resolve_env
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ba_torchrl.training.policy import TrainedPolicy
 
 
-class Settings(EnvSettings):
+class Settings(EnvSettings, ActingSettings):
     """Settings of this command."""
 
     set_by_command: ClassVar[dict[str, str]] = {"seed": "set seed", "expert": "set policy"}
@@ -68,6 +68,8 @@ def _task_and_policy(settings: Settings) -> tuple[ResolvedEnv, Policy | None]:
     is_loaded = settings.policy not in ("expert", "random")
     if settings.task is None and (not is_loaded or settings.policy == "trained"):
         raise ConfigError("task is missing: ba-torchrl play TASK; see --help")
+    if settings.algorithm and (not is_loaded or settings.policy.startswith(LEROBOT)):
+        raise ConfigError("algorithm is of trained policies of this package; leave it out")
     if not is_loaded:
         is_expert = settings.policy == "expert"
         resolved = resolve_env(settings.task, {**settings.env, "expert": is_expert})
@@ -89,7 +91,8 @@ def _trained(settings: Settings) -> TrainedPolicy:
     from ba_torchrl import load_policy
 
     try:
-        return load_policy(settings.task if settings.policy == "trained" else settings.policy)
+        name = settings.task if settings.policy == "trained" else settings.policy
+        return load_policy(name, acting=settings.algorithm)
     except UnknownNameError as error:
         known = ("expert", "random", "trained", *error.known)
         hint = f"; others are expert, random and trained{error.hint}"

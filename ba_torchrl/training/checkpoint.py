@@ -32,6 +32,7 @@ from torchrl.checkpoint import (
 
 from ba_torchrl import __version__
 from ba_torchrl.algorithms.base import Learner
+from ba_torchrl.algorithms.config import ALGORITHMS
 from ba_torchrl.core.config import Which
 from ba_torchrl.core.errors import ConfigError, DamagedFilesError, OtherRunError, check_choice
 from ba_torchrl.core.files import (
@@ -169,15 +170,35 @@ def _read(folder: str | Path) -> dict[str, Any]:
         raise ConfigError(f"cannot read {file}: {error}") from None
 
 
-def parse_saved(saved: dict[str, Any], file: str | Path, **changes: Any) -> ExperimentConfig:
+def parse_saved(
+    saved: dict[str, Any], file: str | Path, acting: Mapping[str, Any] | None = None, **changes: Any
+) -> ExperimentConfig:
     """Return the configuration that a file holds with ``changes``; plugins that it names are not
-    imported, and must be known (`check_known`)."""
+    imported, and must be known (`check_known`).
+
+    Args:
+        saved: the configuration.
+        file: where it is from.
+        acting: other values of fields of the algorithm that the policy acts by.
+        changes: other values of fields.
+    """
     if "plugins" not in changes:
         check_known(saved.get("plugins"), file)
     try:
-        return ExperimentConfig.parse({**saved, **changes}, what=str(file))
+        config = ExperimentConfig.parse({**saved, **changes}, what=str(file))
     except ConfigError as error:
         raise ConfigError(f"this version cannot use {file}: {error}") from None
+    if not acting:
+        return config
+    if other := sorted(acting.keys() - config.algorithm.acting):
+        known = ", ".join(sorted(config.algorithm.acting)) or "none"
+        name = ALGORITHMS.name_of(type(config.algorithm))
+        raise ConfigError(
+            f"algorithm.{other[0]} cannot be set for a trained policy of {name}; fields that it "
+            f"acts by: {known}"
+        )
+    changes["algorithm"] = {**saved["algorithm"], **acting}
+    return ExperimentConfig.parse({**saved, **changes}, what="settings")
 
 
 # -- checkpoints -------------------------------------------------------------------------------

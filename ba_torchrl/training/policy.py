@@ -238,6 +238,7 @@ def load_policy(
     source: str | Path,
     which: Which = "best",
     device: str | torch.device = "cpu",
+    acting: Mapping[str, Any] | None = None,
     **changes: Any,
 ) -> TrainedPolicy:
     """Load a trained policy.
@@ -247,6 +248,8 @@ def load_policy(
             checkpoints; or a ``.safetensors`` file that ``ba-torchrl export`` wrote.
         which: of the checkpoints of a run folder: "best" in evaluation, or "latest".
         device: where it is computed.
+        acting: other values of the algorithm's fields that do not affect learning: ``executed`` and
+            ``steps`` of a policy of chunks.
         changes: further fields of `ExperimentConfig` to override.
 
     Returns:
@@ -266,7 +269,7 @@ def load_policy(
         >>> env.close()
     """
     check_choice("which", which, Which)
-    changes = {**_OF_TRAINING, "device": str(usable_device(device)), **changes}
+    changes = {**_OF_TRAINING, "device": str(usable_device(device)), "acting": acting, **changes}
     if str(source) in TASKS:
         path = shipped_file(str(source))
         if not path.exists():

@@ -6,7 +6,9 @@ import pytest
 import torch
 
 import ba_torchrl
+from ba_torchrl.commands import evaluate, export, play
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.testing.diagnosis import diagnose
 from ba_torchrl.training import protocol
 from ba_torchrl.training.evaluation import record_episodes
@@ -43,6 +45,40 @@ def test_outcomes_do_not_depend_on_the_number_of_environments(experiment):
     for num_envs in (3, 8):
         assert actions(policy, num_envs)[0] == lengths
         assert all(map(torch.equal, actions(policy, num_envs)[1], expected))
+
+
+def inner(policy):
+    """How many actions a policy executes, in how many steps it draws them."""
+    chunks = policy.policy.policy
+    return chunks.executed, chunks.flow.module.steps
+
+
+def test_a_trained_policy_acts_by_other_values(experiment, tmp_path, capsys):
+    run, file = experiment.config.run_dir, tmp_path / "chunks.safetensors"
+    common = ["num_envs=1", "parallel=false", "episodes=1"]
+    export.COMMAND.run([run, f"path={file}", "which=latest", "algorithm.executed=1", *common])
+    trained = ba_torchrl.load_policy(run, which="latest")
+    changed = ba_torchrl.load_policy(run, which="latest", acting={"executed": 1, "steps": 3})
+    assert inner(trained) == (2, 8)
+    assert inner(changed) == (1, 3)
+    assert inner(ba_torchrl.load_policy(file)) == (1, 8)
+    assert changed.config.algorithm.executed == 1
+    capsys.readouterr()
+    evaluate.COMMAND.run([str(file), "algorithm.steps=3", *common])
+    assert f"{file}, algorithm.steps=3" in capsys.readouterr().out
+    with pytest.raises(ConfigError, match=r"algorithm.draws cannot .*: executed, steps"):
+        ba_torchrl.load_policy(run, acting={"draws": 3})
+    with pytest.raises(ConfigError, match=r"executed \(5\) must be at most horizon"):
+        ba_torchrl.load_policy(file, acting={"executed": 5})
+    with pytest.raises(ConfigError, match=r"policy of dagger; .* acts by: none"):
+        ba_torchrl.load_policy("close_loop/block_reaching", acting={"executed": 1})
+
+
+@pytest.mark.parametrize("command", [evaluate, play])
+def test_only_policies_of_this_package_act_by_fields_of_an_algorithm(command, capsys):
+    with pytest.raises(SystemExit):
+        command.COMMAND.run(["policy=lerobot:nothing", "algorithm.executed=1"])
+    assert "algorithm is of" in capsys.readouterr().err
 
 
 def test_the_policy_is_exported_loaded_filmed_and_diagnosed(experiment, tmp_path):
