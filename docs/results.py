@@ -28,7 +28,7 @@ from ba_torchrl.record.leaderboard import (
     read_results,
     success_text,
 )
-from ba_torchrl.record.plots import own_style, save
+from ba_torchrl.record.plots import Learning, own_style, plot_panels, save
 from ba_torchrl.record.report import plot_groups
 from ba_torchrl.record.summary import (
     AXES,
@@ -55,6 +55,7 @@ MEASURES = (
     ("difference", "low", "high"),
 )
 """Columns of the differences, and of their intervals, in a comparison."""
+OVER_DEMONSTRATIONS = "_demonstrations.svg"
 ALL_TASKS = "results"
 """Marker of the tables of all tasks in the page; those of questions are their benchmarks' names."""
 MARKED = re.compile(r"(<!-- (\w+): begin -->\n).*?(<!-- \2: end -->\n)", re.DOTALL)
@@ -131,6 +132,8 @@ def _question(section: Section) -> Iterator[str]:
     """
     axis = AXES[axis_of(section.groups)]
     yield f"![Success over {axis}](results/{section.title}.svg)\n"
+    if (FOLDER / (figure := f"{section.title}{OVER_DEMONSTRATIONS}")).exists():
+        yield f"![Success over demonstrations](results/{figure})\n"
     rows = (_compared_cells(group, *section.span(group.task)) for group in section.groups)
     yield from pipes(COMPARED, *rows)
     yield ""
@@ -205,6 +208,29 @@ def _trained(runs: Sequence[Run]) -> Iterator[str]:
         yield f"Trained on {cpu}: {len(of_cpu)} policies; commits: {', '.join(commits)}.\n"
     if unknown := [f"`{result.task}`" for result in results if result.demonstrations is None]:
         yield f"Demonstrations and expert labels were not recorded for {', '.join(unknown)}.\n"
+
+
+def plot_demonstrations(section: Section, path: Path) -> None:
+    """Plot the success of last policies over the number of demonstrations, for methods that have
+    several in a task; draw nothing where none has."""
+    points: dict[str, dict[str, list[tuple[int, ...]]]] = {}
+    for group in section.groups:
+        number = group.runs[0].result.demonstrations
+        method = " ".join(word for word in group.method.split() if word != str(number))
+        found = points.setdefault(group.task, {}).setdefault(method, [])
+        found.append((number or 0, *group.success))
+    panels = {
+        task: {
+            method: Learning(tuple(zip(*sorted(found), strict=True)))
+            for method, found in methods.items()
+            if len(found) > 1
+        }
+        for task, methods in points.items()
+    }
+    panels = {task: methods for task, methods in panels.items() if methods}
+    if panels:
+        names = sorted({method for methods in panels.values() for method in methods})
+        plot_panels(panels, [path], names=names, xlabel="demonstrations", columns=1)
 
 
 @own_style()
@@ -283,6 +309,7 @@ def main() -> None:
         print(f"{add(sys.argv[1:])} results added")
     for name, section in questions().items():
         plot_groups(section.groups, [FOLDER / f"{name}.svg"], columns=1)
+        plot_demonstrations(section, FOLDER / f"{name}{OVER_DEMONSTRATIONS}")
     plot_tasks(present(), FOLDER / "tasks.svg")
     PAGE.write_text(page_with_results(PAGE.read_text(encoding="utf-8")), encoding="utf-8")
 
