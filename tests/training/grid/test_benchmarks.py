@@ -40,7 +40,7 @@ GRIDS = {
     "demonstrations": (1, 6),
     "equivariance": (1, 4),
     "equivariance_imitation": (2, 24),
-    "flow": (5, 65),
+    "flow": (5, 75),
     "imitation": (2, 12),
     "open_loop_2d": (12, 96),
     "open_loop_3d": (12, 96),
