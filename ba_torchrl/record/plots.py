@@ -52,6 +52,7 @@ def own_style() -> Iterator[None]:
     with rc_context():
         rcdefaults()
         rcParams["text.parse_math"] = False
+        rcParams["pdf.fonttype"] = 42  # TrueType: publishers refuse Matplotlib's Type 3 fonts
         yield
 
 

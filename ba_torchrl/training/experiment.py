@@ -60,7 +60,8 @@ class Experiment:
 
     Raises:
         ConfigError: the run folder holds another run, or this one with other settings, or another
-            process runs it; or a package for its curve or video is missing.
+            process runs it; or a package for its curve or video, or a machine of its collector, is
+            missing.
     """
 
     def __init__(self, config: ExperimentConfig, progress: bool = True) -> None:
@@ -68,6 +69,9 @@ class Experiment:
         if config.threads is not None:
             torch.set_num_threads(config.threads)
         check_packages(config)
+        if config.algorithm.collects:
+            # before demonstrations, and before `run` handles SIGTERM: Ray sets a handler of its own
+            config.collector.connect()
         if config.tf32 is not None:
             torch.backends.cuda.matmul.allow_tf32 = config.tf32
             torch.backends.cudnn.allow_tf32 = config.tf32

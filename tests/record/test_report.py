@@ -654,6 +654,9 @@ def test_panels_share_colours_and_keep_their_names(tmp_path):
     }
     path = tmp_path / "p.svg"
     plot_panels(curves, [path, tmp_path / "p.pdf"], names=["first", "second"])
+    pdf = (tmp_path / "p.pdf").read_bytes()
+    assert b"/TrueType" in pdf or b"/CIDFontType2" in pdf
+    assert b"/Type3" not in pdf
     found = lines(path)
     assert {color: len(curves) for color, curves in found.items()} == {BLUE: 1, ORANGE: 2}
     width = float(re.search(r'viewBox="0 0 ([\d.]+)', path.read_text())[1])

@@ -24,7 +24,8 @@ OBJECT_HEIGHT_M = 0.01
 class SpatialActions:
     """Converts between a spatial network's choices and the actions on its grid.
 
-    Indices of x and y are rows and columns of the heightmap. The action is the centre of the pixel.
+    Indices of x and y are rows and columns of the heightmap. The action is the centre of the pixel,
+    in the reference implementation its corner.
 
     Args:
         actions: the environment's action vector.

@@ -32,7 +32,8 @@ def tool_rotations(rz_rad: Tensor, ry_rad: Tensor, rx_rad: Tensor) -> Tensor:
 def rotated_cells(rotations: Tensor, size: int) -> Tensor:
     """Return the cell of the tool frame that each voxel of a cube is rotated into.
 
-    Voxels are rotated about the centre of the cube.
+    Voxels are rotated about the centre of the cube, in the reference implementation about the voxel
+    of index size / 2.
 
     Args:
         rotations: float64 [N, 3, 3] of the tool frames.

@@ -30,6 +30,10 @@ class CollectorConfig(StrictModel):
         """Raise `ConfigError` unless the collector can be used, before anything starts."""
         return
 
+    def connect(self) -> None:
+        """Raise `ConfigError` unless the collector's machines can be used; a run begins with it."""
+        return
+
     def start(self, problem: Any, positions: Sequence[Any] | None) -> Any:
         """Start to collect; return a `ba_torchrl.training.collectors.base.Collection`.
 

@@ -19,7 +19,7 @@ from ba_torchrl.envs.episode_positions import EpisodePosition
 from ba_torchrl.training.collectors.base import CollectionProblem
 from ba_torchrl.training.collectors.ray_config import RayCollectorConfig
 from ba_torchrl.training.collectors.workers import WorkerCollection, failed_too_often
-from ba_torchrl.training.ray_cluster import check_resources, connected_ray, ray_module
+from ba_torchrl.training.ray_cluster import ray_module
 
 _FOREVER = sys.maxsize
 
@@ -50,8 +50,7 @@ class RayCollection(WorkerCollection):
 
     def __init__(self, problem: CollectionProblem, config: RayCollectorConfig) -> None:
         super().__init__(problem, config)
-        connected_ray(config.address)
-        check_resources("collector", config.workers * config.cpus, config.workers * config.gpus)
+        config.connect()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", UserWarning)  # the policy is made by the workers
             self._collector = _RestartingCollector(self)

@@ -7,7 +7,7 @@ from typing import ClassVar
 from pydantic import Field
 
 from ba_torchrl.training.collectors.config import COLLECTORS, WorkersConfig
-from ba_torchrl.training.ray_cluster import check_installed
+from ba_torchrl.training.ray_cluster import check_installed, check_resources, connected_ray
 
 
 @COLLECTORS.register("ray")
@@ -34,3 +34,8 @@ class RayCollectorConfig(WorkersConfig):
         """Check that Ray is installed, and what `WorkersConfig` checks."""
         super().check(num_envs)
         check_installed("collector")
+
+    def connect(self) -> None:
+        """Connect to the cluster, and check that it has the resources that the workers need."""
+        connected_ray(self.address)
+        check_resources("collector", self.workers * self.cpus, self.workers * self.gpus)

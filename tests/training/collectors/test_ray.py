@@ -29,6 +29,17 @@ def test_without_ray_one_line_says_how_to_install_it(tmp_path, monkeypatch):
     assert "\n" not in str(raised.value)
 
 
+def test_a_cluster_that_is_too_small_is_noticed_before_anything_starts(tmp_path, monkeypatch):
+    module = Mock()
+    module.cluster_resources.return_value = {"CPU": 1.0}
+    monkeypatch.setattr(ray_cluster, "find_spec", Mock())
+    monkeypatch.setattr(ray_cluster, "ray_module", lambda: module)
+    config = config_for(tmp_path, OPTIONS)
+    with pytest.raises(ConfigError, match="2 CPUs are needed, the Ray cluster has 1"):
+        Experiment(config, progress=False)
+    assert not (tmp_path / "run").exists()
+
+
 def test_more_failures_than_max_restarts_end_the_collection(tmp_path, monkeypatch):
     """Ray counts the failures of each task; it raises the error of the actor in the end."""
 
