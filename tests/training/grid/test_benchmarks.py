@@ -34,7 +34,7 @@ GRIDS = {
     "close_loop_3d": (10, 170),
     "close_loop_4d": (10, 170),
     "close_loop_small": (1, 13),
-    "cpu_close_loop": (10, 35),
+    "cpu_close_loop": (10, 39),
     "cpu_open_loop": (12, 12),
     "cpu_six_dof": (9, 9),
     "demonstrations": (1, 6),
