@@ -86,7 +86,9 @@ def plot_panels(
     height_in = max(panel_in[1], gap_in * max(map(len, panels.values())))
     longest = max((len(line) for lines in labels.values() for line in lines), default=0)
     width_in = panel_in[0] + 0.6 * _LABEL_PT / 72 * longest
-    size_in = columns * width_in, rows * (height_in + 0.7)
+    demonstrated = any(each.demonstration_steps for of in panels.values() for each in of.values())
+    xlabel += "\ndotted, left of 0: steps of demonstrations" if demonstrated else ""
+    size_in = columns * width_in, rows * (height_in + 0.75) + (0.2 if demonstrated else 0.0)
     figure = Figure(figsize=size_in, dpi=150, layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
@@ -107,8 +109,6 @@ def plot_panels(
         axes.spines[["top", "right"]].set_visible(False)
     for axes in grid.flat[len(panels) :]:
         axes.set_visible(False)
-    demonstrated = any(each.demonstration_steps for of in panels.values() for each in of.values())
-    xlabel += "\ndotted, left of 0: steps of demonstrations" if demonstrated else ""
     figure.supxlabel(xlabel, fontsize=10)
     figure.supylabel(ylabel, fontsize=10)
     for path in map(Path, paths):

@@ -701,9 +701,12 @@ def test_labels_are_apart_and_within_the_picture(tmp_path, count):
     names = [f"an algorithm on its network {i}" for i in range(count)]
     x = np.arange(5)
     path = tmp_path / "p.png"
-    plot_panels({"task": dict.fromkeys(names, Learning((x, x / 8)))}, [path], names=names)
+    plot_panels({"task": dict.fromkeys(names, Learning((x, x / 8), (), 1.0))}, [path], names=names)
     picture = imageio.imread(path)[..., :3] / 255
     for edge in (picture[:, :2], picture[:, -2:], picture[:2], picture[-2:]):
         assert (edge > 0.99).all()
     labels = (picture[:, int(0.75 * picture.shape[1]) :] < 0.5).all(-1).any(1)
-    assert np.diff(labels.astype(int)).clip(0).sum() >= 2 * count  # two lines each
+    lines = np.flatnonzero(np.diff(labels.astype(int)) == 1)
+    assert len(lines) >= 2 * count  # two lines each
+    within, between = (np.diff(lines)[start : 2 * count - 1 : 2].mean() for start in (0, 1))
+    assert between > within
