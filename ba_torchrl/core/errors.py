@@ -185,6 +185,18 @@ class ReplaySchemaError(ValueError):
     """Transitions whose entries, types or shapes differ from those already stored."""
 
 
+class BatchError(ValueError, KeyError):
+    """A batch whose entries, types or shapes a loss or a network cannot use."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])
+
+
+def layout(dtype: object, shape: Iterable[int]) -> str:
+    """Return the type and shape of a tensor as text, such as "float32[6, 1]"."""
+    return f"{str(dtype).removeprefix('torch.')}{list(shape)}"
+
+
 def as_os_error(error: RuntimeError) -> OSError | None:
     """Return the error of the operating system that torch's text tells of, or None.
 

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from typing_extensions import Self
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.config import NETWORKS, NetworkConfig
 
@@ -44,8 +45,12 @@ class ActorCriticSpec:
     center_m: tuple[float, float] = (0.0, 0.0)
 
     def __post_init__(self) -> None:
+        if keys.DEPTH not in self.images:
+            found = list(self.images)
+            raise ConfigError(f"images lack {keys.DEPTH!r}: {found}; SpatialSpec takes heightmaps")
         letters = self.action_sequence
-        if not letters or len(set(letters)) != len(letters) or set(letters) - set(ACTION_LETTERS):
+        known = set(ACTION_LETTERS) if isinstance(letters, str) else set()
+        if not letters or not known or len(set(letters)) != len(letters) or set(letters) - known:
             raise ValueError(
                 f"action_sequence must hold different letters of {ACTION_LETTERS!r}, "
                 f"got {letters!r}"
@@ -60,6 +65,11 @@ class ActorCriticSpec:
     def image_channels(self) -> int:
         """Channels of ``depth``."""
         return self.images[keys.DEPTH].channels
+
+    @property
+    def image_shape(self) -> tuple[int, int, int]:
+        """Shape [C, H, W] of ``depth``."""
+        return self.image_channels, self.image_size, self.image_size
 
     @property
     def vector_size(self) -> int:

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import BatchError, layout
 from ba_torchrl.core.evaluation_mode import evaluation_copy
 from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.modules.base import ActorCritic, ActorCriticSpec, Frames
@@ -71,6 +72,12 @@ class ChunkHead(nn.Module):
             time: from 0, noise, to 1, no noise, [...].
         """
         group, size = self.frames.shape[:2]
+        wanted = [self.horizon, size]
+        if list(chunk.shape[-2:]) != wanted or chunk.dtype != self.frames.dtype:
+            raise BatchError(
+                f"a chunk is {layout(chunk.dtype, chunk.shape)}, and must be "
+                f"{layout(self.frames.dtype, wanted)} for each sample: horizon, action"
+            )
         vectors = self.vector_frames.shape[-1]
         image, vector = features.split([self.fields * group, vectors], dim=-1)
         image = F.layer_norm(image, image.shape[-1:])

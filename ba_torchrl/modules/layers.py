@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import wraps
 from typing import Any, TypeVar
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from ba_torchrl.core import hardware
 from ba_torchrl.core.choices import Precision
+from ba_torchrl.core.errors import BatchError, layout
 
 Value = TypeVar("Value")
 
@@ -122,6 +123,21 @@ def compute_dtype(precision: Precision, device: torch.device) -> torch.dtype:
     if precision == "auto":
         return torch.bfloat16 if _bfloat16_is_fast(device.type) else torch.float32
     return getattr(torch, precision)
+
+
+def check_image(key: str, image: Tensor, shape: Sequence[int]) -> None:
+    """Raise `BatchError` unless an image has the shape that a network was built for.
+
+    Args:
+        key: of the image.
+        image: [..., C, H, W], of a floating type.
+        shape: [C, H, W].
+    """
+    if image.shape[-3:] != shape or not image.is_floating_point():
+        raise BatchError(
+            f"{key!r} is {layout(image.dtype, image.shape)}, and must be of a floating type and "
+            f"end in {list(shape)}: channels, rows and columns that the network was built for"
+        )
 
 
 def scaled_width(width: int, scale: float) -> int:

@@ -126,8 +126,28 @@ class TransitionLoss(EvalModeTargetsLoss):
     def _transition_keys(self, observation: list[NestedKey]) -> list[NestedKey]:
         """Return the keys of a transition: observation, action, reward and done flags."""
         ends = (self.tensor_keys.reward, self.tensor_keys.done, self.tensor_keys.terminated)
-        names = [self.tensor_keys.action, *observation, *map(_next, (*observation, *ends))]
+        names = [self.tensor_keys.action, *observation, *map(next_key, (*observation, *ends))]
         return list(dict.fromkeys(names))
+
+    def _missing(self, tensordict: TensorDictBase) -> list[NestedKey]:
+        missing = super()._missing(tensordict)
+        ends = [next_key(self.tensor_keys.done), next_key(self.tensor_keys.terminated)]
+        # as in TorchRL, one of the two stands for the other
+        return missing if set(ends) <= set(missing) else [key for key in missing if key not in ends]
+
+    def _prepare(self, tensordict: TensorDictBase, key: NestedKey, own_dims: int) -> None:
+        super()._prepare(tensordict, key, own_dims)
+        names, shape = self.tensor_keys, tensordict.batch_size
+        for name, dtype, *others in (
+            (next_key(names.reward), None),
+            (next_key(names.done), torch.bool),
+            (next_key(names.terminated), torch.bool),
+            (names.is_demonstration, torch.bool, shape),
+            (names.priority_weight, None, shape),
+        ):
+            value = tensordict.get(name, None)
+            if value is not None:
+                self._require(name, value, dtype, [*shape, 1], *others)
 
     def _importance_weights(self, tensordict: TensorDictBase) -> dict[str, Tensor | None]:
         """Return the weights [...] of a term's samples, by the narrowest of `WeightedTerms` that
@@ -187,5 +207,6 @@ def _positive(value: Tensor) -> Tensor:
     return value.clamp_min(torch.finfo(value.dtype).tiny)
 
 
-def _next(key: NestedKey) -> tuple[str, ...]:
+def next_key(key: NestedKey) -> tuple[str, ...]:
+    """Return the key of an entry of the next state."""
     return (keys.NEXT, key) if isinstance(key, str) else (keys.NEXT, *key)

@@ -6,6 +6,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from ba_torchrl.core.choices import ActionDistance
+from ba_torchrl.core.errors import BatchError
 
 
 def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance) -> Tensor:
@@ -22,6 +23,11 @@ def action_distance(action: Tensor, expert_action: Tensor, kind: ActionDistance)
         expert_action: [..., A] in [-1, 1].
         kind: "mse" or "kl".
     """
+    if action.shape[-1] != expert_action.shape[-1]:
+        raise BatchError(
+            f"the policy's actions have {action.shape[-1]} components, and the expert's "
+            f"{expert_action.shape[-1]}"
+        )
     if kind == "mse":
         return (action - expert_action).square().mean(dim=-1)
     expert, policy = (1 + expert_action.to(action).clamp(-1, 1)) / 2, (1 + action) / 2

@@ -13,8 +13,9 @@ from torch import Tensor, nn
 from torchrl.modules import QValueActor
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import check_choice
-from ba_torchrl.objectives.base import TransitionLoss
+from ba_torchrl.core.errors import BatchError, check_choice, layout
+from ba_torchrl.objectives.base import TransitionLoss, next_key
+from ba_torchrl.objectives.networks import check_network
 
 Demonstrations = Literal["none", "dqfd", "sdqfd", "adet"]
 """The loss on demonstrated actions that is added to the TD loss."""
@@ -98,8 +99,16 @@ class SingleLevelValues(nn.Module):
     def forward(self, *observation_and_action: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return the values of all actions [B, N], and the index of the given action [B]."""
         *observation, action = observation_and_action
+        values = self._action_values(observation)
+        wanted = values.shape if self.is_one_hot else values.shape[:1]
+        if action.shape != wanted and (self.is_one_hot or action.shape != (*wanted, 1)):
+            kind = "one-hot" if self.is_one_hot else "categorical"
+            raise BatchError(
+                f"the actions are {layout(action.dtype, action.shape)}, and must be {list(wanted)} "
+                f"in the QValueActor's action space, which is {kind}"
+            )
         chosen = action.long().argmax(dim=-1) if self.is_one_hot else action.reshape(len(action))
-        return [(self._action_values(observation), chosen.long())]
+        return [(values, chosen.long())]
 
     def of_moves(self, *observation_and_moves: Tensor) -> list[tuple[Tensor, Tensor]]:
         """Return the values of all actions [B, N], and which are among some, bool [B, N]."""
@@ -116,8 +125,15 @@ class SingleLevelValues(nn.Module):
 
 
 def as_levels(network: LevelValues | QValueActor) -> LevelValues:
-    """Return a network of levels, which a `QValueActor` becomes as `SingleLevelValues`."""
-    return SingleLevelValues(network) if isinstance(network, QValueActor) else network
+    """Return a network of levels, which a `QValueActor` becomes as `SingleLevelValues`.
+
+    Raises:
+        ConfigError: the network is of another kind.
+    """
+    if isinstance(network, QValueActor):
+        return SingleLevelValues(network)
+    check_network("value_network", network, "action_dims")
+    return network
 
 
 def large_margin(q: Tensor, chosen: Tensor, margin: float) -> Tensor:
@@ -223,6 +239,8 @@ class LevelDQNLoss(TransitionLoss):
     value_network_params: TensorDictParams
     target_value_network_params: TensorDictParams
 
+    _without_flag = "; for plain DQN set demonstrations='none'"
+
     out_keys = (
         "loss_qvalue",
         "loss_demonstration",
@@ -282,8 +300,7 @@ class LevelDQNLoss(TransitionLoss):
             KeyError: an entry is missing, such as the demonstration flag if there is a term on
                 demonstrations.
         """
-        reward = tensordict[keys.NEXT, self.tensor_keys.reward]
-        self._set_batch_size(tensordict, reward.ndim - 1)
+        self._prepare(tensordict, next_key(self.tensor_keys.reward), 1)
         if tensordict.ndim != 1:
             return self._of_one_dimension(tensordict, self.tensor_keys.priority)
         target = self._target(tensordict)

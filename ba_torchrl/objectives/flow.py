@@ -13,7 +13,7 @@ from torch import Tensor, nn
 
 from ba_torchrl.core import keys
 from ba_torchrl.objectives.imitation import ImitationLoss
-from ba_torchrl.objectives.networks import Reduction
+from ba_torchrl.objectives.networks import Reduction, check_network
 
 
 class ChunkNetwork(Protocol):
@@ -83,6 +83,7 @@ class FlowMatchingLoss(ImitationLoss):
     ) -> None:
         if draws < 1:
             raise ValueError(f"draws must be at least 1, got {draws}")
+        check_network("actor_network", actor_network, "module.encoder")
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
         self.draws = draws
@@ -96,8 +97,9 @@ class FlowMatchingLoss(ImitationLoss):
             tensordict: observations [...], chunks [..., T, A], and which of their actions count
                 [..., T].
         """
+        self._prepare(tensordict, self.tensor_keys.action, 2)
         chunk, is_valid = (tensordict[key] for key in astuple(self.tensor_keys))
-        self._set_batch_size(tensordict, chunk.ndim - 2)
+        self._require(self.tensor_keys.is_valid, is_valid, None, chunk.shape[:-1])
         flow: ChunkNetwork = self.network("actor_network").module
         observation = [tensordict[key] for key in self._observation]
         noise = torch.randn(self.draws, *chunk.shape, dtype=chunk.dtype, device=chunk.device)

@@ -23,6 +23,7 @@ from ba_torchrl.objectives.dqn import LevelValues, as_levels
 from ba_torchrl.objectives.networks import (
     EvalModeTargetsLoss,
     Reduction,
+    check_network,
     checked_reduction,
 )
 
@@ -95,6 +96,7 @@ class BehaviourCloningLoss(ImitationLoss):
         reduction: Reduction | None = None,
     ) -> None:
         check_choice("distance", distance, ActionDistance)
+        check_network("actor_network", actor_network, "get_dist")
         super().__init__(reduction)
         self.convert_to_functional(actor_network, "actor_network")
         self.distance: ActionDistance = distance
@@ -110,7 +112,7 @@ class BehaviourCloningLoss(ImitationLoss):
             tensordict: observations and expert actions [...]. The observation's entries may have a
                 dimension of views after the batch.
         """
-        self._set_batch_size(tensordict, tensordict[self.tensor_keys.action].ndim - 1)
+        self._prepare(tensordict, self.tensor_keys.action, 1)
         actor = self.network("actor_network")
         with self.actor_network_params.to_module(actor, preserve_module_state=False):
             distribution = actor.get_dist(tensordict.select(*actor.in_keys))
@@ -195,9 +197,8 @@ class LevelCrossEntropyLoss(ImitationLoss):
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Return ``loss_bc`` of observations and expert actions [...], and the fraction of choices
         that are the expert's as ``accuracy``."""
-        action = tensordict[self.tensor_keys.action]
         own_dims = self.value_network.action_dims + self.of_sets
-        self._set_batch_size(tensordict, action.ndim - own_dims)
+        self._prepare(tensordict, self.tensor_keys.action, own_dims)
         if tensordict.ndim != 1:
             return self._of_one_dimension(tensordict)
         network = self.network("value_network")

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import warnings
-from typing import Any, Literal, TypeVar
+from collections.abc import Sequence
+from operator import attrgetter
+from typing import Any, ClassVar, Literal, TypeVar
 
 import torch
 from tensordict import TensorDictBase, TensorDictParams
 from tensordict.utils import NestedKey
-from torch import nn
+from torch import Tensor, nn
 from torchrl.objectives import LossModule
 from torchrl.objectives.utils import TargetNetUpdater
 
-from ba_torchrl.core.errors import check_choice
+from ba_torchrl.core.errors import BatchError, ConfigError, check_choice, layout
 from ba_torchrl.core.evaluation_mode import evaluation_copy
 
 Updater = TypeVar("Updater", bound=TargetNetUpdater)
@@ -28,6 +30,8 @@ class EvalModeTargetsLoss(LossModule):
     """
 
     reduction: Reduction
+    _without_flag: ClassVar[str] = ""
+    """What to do with a batch that lacks the flag of demonstrations."""
 
     def convert_to_functional(
         self, module: nn.Module, module_name: str, *args: Any, **kwargs: Any
@@ -70,10 +74,48 @@ class EvalModeTargetsLoss(LossModule):
             names = ", ".join(sorted(kept))
             warnings.warn(f"{names}: parameters kept, without reset_parameters", stacklevel=2)
 
-    def _set_batch_size(self, tensordict: TensorDictBase, dims: int) -> None:
-        """Give tensors that were passed by name, and have no batch size yet, one of ``dims``."""
+    def _prepare(self, tensordict: TensorDictBase, key: NestedKey, own_dims: int) -> None:
+        """Check a batch, and give tensors that were passed by name a batch size.
+
+        Args:
+            tensordict: of samples.
+            key: of an entry whose dimensions are those of the batch and, last, ``own_dims``.
+        """
+        missing = self._missing(tensordict)
+        if missing:
+            found = ", ".join(map(repr, sorted(tensordict.keys(True, True), key=str)))
+            is_flag = getattr(self.tensor_keys, "is_demonstration", None) in missing
+            raise BatchError(
+                f"{type(self).__name__}: the batch lacks {', '.join(map(repr, missing))}; it has "
+                f"{found or 'no entries'}{self._without_flag if is_flag else ''}"
+            )
+        value = tensordict.get(key)
+        dims = value.ndim - own_dims
         if not tensordict.batch_size:
-            tensordict.auto_batch_size_(dims)
+            tensordict.auto_batch_size_(max(0, dims))
+        shape = list(tensordict.batch_size)
+        if 0 in shape:
+            raise BatchError(f"{type(self).__name__}: the batch is empty")
+        if dims < len(shape):
+            raise BatchError(
+                f"{type(self).__name__}: {key!r} is {layout(value.dtype, value.shape)}, and must "
+                f"have {len(shape) + own_dims} dimensions, {own_dims} after the batch's {shape}"
+            )
+
+    def _missing(self, tensordict: TensorDictBase) -> list[NestedKey]:
+        """Return the keys of the entries that `forward` needs and a batch lacks."""
+        return [key for key in self.in_keys if tensordict.get(key, None) is None]
+
+    def _require(
+        self, key: NestedKey, value: Tensor, dtype: torch.dtype | None, *shapes: Sequence[int]
+    ) -> None:
+        """Raise `BatchError` unless an entry has a type, if any is given, and one of the shapes."""
+        if dtype not in (None, value.dtype) or list(value.shape) not in map(list, shapes):
+            wanted = " or ".join(layout(dtype or value.dtype, shape) for shape in shapes)
+            raise BatchError(
+                f"{type(self).__name__}: {key!r} is {layout(value.dtype, value.shape)}, and must "
+                f"be {wanted}"
+            )
 
     def _of_one_dimension(self, tensordict: TensorDictBase, *written: NestedKey) -> TensorDictBase:
         """Return the loss of a batch of any shape, by `forward` of its samples in one dimension.
@@ -91,6 +133,27 @@ class EvalModeTargetsLoss(LossModule):
                 if losses.ndim:
                     out.set(key, losses.reshape(shape))
         return out
+
+
+_INSTEAD = {
+    "get_dist": "a ProbabilisticActor, such as squashed_gaussian_policy(actor, in_keys)",
+    "out_keys": "TensorDictModule(network, in_keys, out_keys)",
+    "action_dims": "a QValueActor, or SpatialValues(network, actions)",
+    "module.encoder": 'TensorDictModule(ChunkFlow(encoder, head), [*in_keys, "noise"], out_keys)',
+}
+"""By the attribute of a network that a loss uses, what has it."""
+
+
+def check_network(name: str, network: object, attribute: str) -> None:
+    """Raise `ConfigError` unless a loss's argument with a name is a network with ``in_keys`` and an
+    attribute that the loss uses."""
+    try:
+        attrgetter("in_keys", attribute)(network)
+    except AttributeError:
+        raise ConfigError(
+            f"{name} is a {type(network).__name__}, without in_keys or {attribute}: pass "
+            f"{_INSTEAD[attribute]}"
+        ) from None
 
 
 def checked_reduction(reduction: Reduction | None) -> Reduction:

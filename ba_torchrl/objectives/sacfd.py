@@ -23,6 +23,7 @@ from ba_torchrl.core.choices import ActionDistance
 from ba_torchrl.core.errors import check_choice
 from ba_torchrl.objectives.base import TransitionLoss
 from ba_torchrl.objectives.distance import action_distance
+from ba_torchrl.objectives.networks import check_network
 
 
 class SACfDLoss(TransitionLoss):
@@ -127,6 +128,8 @@ class SACfDLoss(TransitionLoss):
     target_encoder_network_params: TensorDictParams
     target_qvalue_network_params: TensorDictParams
 
+    _without_flag = "; for plain SAC set demonstration_weight=0"
+
     out_keys = (
         "loss_actor",
         "loss_qvalue",
@@ -156,6 +159,9 @@ class SACfDLoss(TransitionLoss):
         if alpha_init <= 0:
             raise ValueError(f"alpha_init must be positive, got {alpha_init}")
         check_choice("demonstration_distance", demonstration_distance, ActionDistance)
+        check_network("actor_network", actor_network, "get_dist")
+        check_network("encoder_network", encoder_network, "out_keys")
+        check_network("qvalue_network", qvalue_network, "out_keys")
         if len(encoder_network.out_keys) != 1:
             raise ValueError(
                 f"encoder_network must write one entry, got {encoder_network.out_keys}"
@@ -249,7 +255,7 @@ class SACfDLoss(TransitionLoss):
             KeyError: an entry is missing, such as the flag of demonstrations if the behaviour term
                 has a weight.
         """
-        self._set_batch_size(tensordict, tensordict[self.tensor_keys.action].ndim - 1)
+        self._prepare(tensordict, self.tensor_keys.action, 1)
         weights = self._importance_weights(tensordict)
         state = self._observation(tensordict, self.views)
         features = self._features(state, self.encoder_network_params)
@@ -344,6 +350,10 @@ class SACfDLoss(TransitionLoss):
         """Return the critics' target y, [..., 1]."""
         following = self._observation(tensordict.get(keys.NEXT), self.target_views)
         action, log_prob = self._sample_action(following)
+        stored = tensordict[self.tensor_keys.action]
+        dtype = action.dtype if stored.dtype == torch.float64 else None
+        shape = stored.shape[:-1] + action.shape[-1:]
+        self._require(self.tensor_keys.action, stored, dtype, shape)
         features = self._features(following, self.target_encoder_network_params)
         q = self._values(features, action, self.target_qvalue_network_params)
         value = self._target_value(q)
@@ -406,11 +416,6 @@ class SACfDLoss(TransitionLoss):
         flag = tensordict.get(self.tensor_keys.is_demonstration, None)
         if flag is not None:
             return flag.reshape(tensordict.batch_size)
-        if self._needs_demonstration_flag:
-            raise KeyError(
-                f"the batch lacks {self.tensor_keys.is_demonstration!r}, which the behaviour term "
-                "needs; for plain SAC set demonstration_weight=0"
-            )
         action = tensordict[self.tensor_keys.action]
         return torch.zeros(tensordict.batch_size, dtype=torch.bool, device=action.device)
 

@@ -1,16 +1,20 @@
 """Every registered actor-critic: sizes, shapes, precision, errors; parameters that are reset."""
 
+import re
+
 import pytest
 import torch
 from pydantic import ValidationError
 from tensordict.nn import TensorDictModule
 from torch import nn
 
+from ba_torchrl.core.errors import BatchError, ConfigError
 from ba_torchrl.modules import layers
-from ba_torchrl.modules.base import NETWORKS
+from ba_torchrl.modules.base import NETWORKS, ActorCriticSpec
 from ba_torchrl.modules.layers import compute_dtype
+from ba_torchrl.modules.spatial.base import SpatialSpec
 from tests.modules.networks import ACTOR_CRITICS, SPATIAL, actor_critic as small, count, spatial
-from tests.specs import actor_critic_spec
+from tests.specs import actor_critic_spec, spatial_spec
 
 
 @pytest.mark.parametrize(
@@ -154,7 +158,32 @@ def test_what_cannot_be_built_is_refused(name, fields, spec, message):
         NETWORKS[name](**fields).build(actor_critic_spec(*spec))
 
 
-@pytest.mark.parametrize("sequence", ["", "pxx", "pxyq"])
+@pytest.mark.parametrize(
+    ("shape", "dtype"),
+    [
+        ((2, 1, 76, 76), torch.float32),
+        ((2, 64, 64), torch.float32),
+        ((2, 64, 64, 1), torch.float32),
+        ((2, 1, 64, 64), torch.uint8),
+    ],
+    ids=str,
+)
+@pytest.mark.parametrize("name", ACTOR_CRITICS)
+def test_images_for_which_a_network_was_not_built_are_refused(name, shape, dtype):
+    message = re.escape(f"'depth' is {str(dtype)[6:]}{list(shape)}, and must be of a floating type")
+    with pytest.raises(BatchError, match=message):
+        small(name).actor(torch.zeros(shape, dtype=dtype), torch.zeros(2, 1))
+
+
+def test_images_of_the_other_control_are_refused():
+    depth, heights = actor_critic_spec(64, "pxyzr").images, spatial_spec().images
+    with pytest.raises(ConfigError, match=r"images lack 'depth': .*; SpatialSpec takes heightmaps"):
+        ActorCriticSpec(heights, "pxyzr")
+    with pytest.raises(ConfigError, match=r"images lack .*; ActorCriticSpec takes depth images"):
+        SpatialSpec(depth, ("x", "y"))
+
+
+@pytest.mark.parametrize("sequence", ["", "pxx", "pxyq", 5])
 def test_bad_action_sequences_are_refused(sequence):
     with pytest.raises(ValueError, match="action_sequence"):
         actor_critic_spec(64, sequence)

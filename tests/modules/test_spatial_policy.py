@@ -8,6 +8,7 @@ from torch import nn
 from torchrl.envs.utils import ExplorationType, set_exploration_type
 
 from ba_torchrl.core.actions import OpenLoopActions
+from ba_torchrl.core.errors import BatchError
 from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
 from ba_torchrl.modules.spatial.policy import (
     SpatialActions,
@@ -185,6 +186,13 @@ def test_greedy_chooses_the_best_pixel_and_then_its_best_yaw():
         yaw = int(network.yaws[primitive, row, column].argmax())
         assert chosen[primitive].tolist() == [row, column, yaw]
         assert value[primitive, 0] == network.yaws[primitive, row, column, yaw]
+
+
+@pytest.mark.parametrize("shape", [(2, 6, 8), (2, 1, 8, 6), (2, 6, 8, 1), (2, 1, 12, 16)])
+def test_heightmaps_of_another_shape_than_the_grid_are_refused(shape):
+    _, in_hand, holding = observation(2)
+    with pytest.raises(BatchError, match=r"'heightmap' is .* end in \[1, 6, 8\]"):
+        SpatialValues(Table(), layout()).greedy(torch.zeros(shape), in_hand, holding)
 
 
 def test_later_levels_are_conditioned_on_the_choices_of_the_action():

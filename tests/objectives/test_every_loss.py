@@ -2,6 +2,7 @@
 
 import copy
 import dataclasses
+import re
 
 import pytest
 import torch
@@ -13,6 +14,7 @@ from torchrl.objectives import HardUpdate, SoftUpdate, ValueEstimators
 from torchrl.objectives.value import TD0Estimator
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import BatchError
 from ba_torchrl.modules.chunks import ChunkFlow, ChunkHead
 from ba_torchrl.modules.spatial.policy import SpatialValues
 from ba_torchrl.objectives import (
@@ -208,6 +210,64 @@ def test_in_keys_are_what_a_loss_needs_and_out_keys_what_it_returns(name):
     assert torch.equal(called(loss, data)[chosen], out[chosen])
 
 
+@each_of_ours
+def test_a_batch_that_lacks_an_entry_or_is_empty_is_refused(name):
+    loss, data = make(name), data_of(name)
+    either = {(keys.NEXT, keys.DONE), (keys.NEXT, keys.TERMINATED)}  # stands for the other
+    for key in loss.in_keys:
+        if key in either:
+            loss(data.exclude(key))
+            continue
+        message = f"{type(loss).__name__}: the batch lacks {key!r}; it has "
+        with pytest.raises(BatchError, match=re.escape(message)):
+            loss(data.exclude(key))
+    with pytest.raises(BatchError, match="the batch is empty"):
+        loss(data[:0])
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ((keys.NEXT, keys.REWARD), lambda value: value[:, 0], r"float32\[20\], and must"),
+        ((keys.NEXT, keys.TERMINATED), lambda value: value[:, 0], r"must be bool\[20, 1\]"),
+        ((keys.NEXT, keys.TERMINATED), lambda value: value.long(), r"int64\[20, 1\], and must be"),
+        (keys.IS_DEMONSTRATION, lambda value: value.float(), r"bool\[20, 1\] or bool\[20\]"),
+    ],
+)
+@pytest.mark.parametrize("name", ["sacfd", "level_dqn", "one_hot"])
+def test_transitions_of_other_types_and_shapes_are_refused(name, key, change, message):
+    data = data_of(name)
+    with pytest.raises(BatchError, match=message):
+        make(name)(data.set(key, change(data[key])))
+
+
+@pytest.mark.parametrize(
+    ("name", "key", "change", "message"),
+    [
+        (
+            "sacfd",
+            keys.ACTION,
+            lambda value: value[:, :1],
+            r"float32\[20, 1\], and must",
+        ),
+        ("sacfd", keys.ACTION, torch.Tensor.double, r"float64\[20, 2\], and must be float32"),
+        ("bc", keys.ACTION, lambda value: value[:, :1], "have 2 components, and the expert's 1"),
+        ("level_dqn", keys.ACTION, lambda value: value[:, 1:], "one per letter of 'pxyzrrr'"),
+        ("sets", keys.ACTION, lambda value: value[:, 0], "must have 3 dimensions, 2 after"),
+        ("categorical", keys.ACTION, lambda value: value[:, None].expand(-1, 5), "categorical"),
+        ("one_hot", keys.ACTION, lambda value: value[:, :1], r"must be \[20, 5\] .* one-hot"),
+        ("flow", keys.TARGET_CHUNK, lambda value: value[:, 0], "must have 3 dimensions, 2 after"),
+        ("flow", keys.TARGET_CHUNK, lambda value: value[..., :1], r"must be float32\[4, 2\] for"),
+        ("flow", keys.TARGET_CHUNK, torch.Tensor.double, r"must be float32\[4, 2\] for each"),
+        ("flow", keys.TARGET_CHUNK_MASK, lambda value: value[:, :1], r"must be bool\[20, 4\]"),
+    ],
+)
+def test_actions_of_other_types_and_shapes_are_refused(name, key, change, message):
+    data = data_of(name)
+    with pytest.raises(BatchError, match=message):
+        make(name)(data.set(key, change(data[key])))
+
+
 @every_loss
 def test_a_loss_changes_no_entry_of_its_batch_and_repeats_itself(name):
     loss, data = make(name), data_of(name)
@@ -324,9 +384,20 @@ def test_a_reset_names_the_modules_that_it_cannot_reset(monkeypatch):
         (lambda: flow(draws=0), "draws must be at least 1, got 0"),
         (lambda: sac(RLPDLoss, 3, subset=0), "subset must be at least 1, got 0"),
         (lambda: levels(margin=-0.1), "margin must not be negative, got -0.1"),
+        (
+            lambda: SACfDLoss(LinearPolicy(), LinearEncoder(), LinearCritics(2)),
+            "actor_network is a LinearPolicy, without .*: pass a ProbabilisticActor",
+        ),
+        (
+            lambda: SACfDLoss(policy(), LinearEncoder(), LinearCritics(2)),
+            r"encoder_network is a LinearEncoder, without .*: pass TensorDictModule\(",
+        ),
+        (lambda: BehaviourCloningLoss(LinearPolicy()), "pass a ProbabilisticActor"),
+        (lambda: LevelDQNLoss(Tables()), r"pass a QValueActor, or SpatialValues\("),
+        (lambda: FlowMatchingLoss(policy()), r"pass TensorDictModule\(ChunkFlow\("),
     ],
 )
-def test_numbers_without_a_meaning_are_refused(make_loss, message):
+def test_arguments_without_a_meaning_are_refused(make_loss, message):
     with pytest.raises(ValueError, match=message):
         make_loss()
 

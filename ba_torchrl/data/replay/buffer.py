@@ -10,9 +10,9 @@ from torchrl.data import TensorDictReplayBuffer
 from torchrl.data.replay_buffers.samplers import Sampler
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError, ReplaySchemaError
+from ba_torchrl.core.errors import ConfigError, ReplaySchemaError, layout
 from ba_torchrl.core.files import StateFolder
-from ba_torchrl.data.replay.storage import FrameStorage
+from ba_torchrl.data.replay.storage import FrameStorage, stored_flags
 from ba_torchrl.data.replay.writer import ExpertKeepingWriter
 
 _INDEX = "index"  # TorchRL's writer adds it
@@ -98,6 +98,9 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
             ReplaySchemaError: entries, types or shapes are not those of the stored ones.
             ConfigError: demonstrations leave no room for these transitions.
         """
+        if not isinstance(tensordicts, TensorDictBase):
+            kind = type(tensordicts).__name__
+            raise ReplaySchemaError(f"transitions must be a TensorDict [N], not a {kind}")
         if tensordicts.ndim != 1:
             raise ReplaySchemaError(
                 f"transitions must have one batch dimension, got {tuple(tensordicts.shape)}; "
@@ -116,15 +119,13 @@ class FrameReplayBuffer(StateFolder, TensorDictReplayBuffer):
     @property
     def num_demonstrations(self) -> int:
         """Number of stored transitions with the flag ``is_demonstration``."""
-        return int(self.storage.column(keys.IS_DEMONSTRATION).sum()) if len(self) else 0
+        return int(stored_flags(self.storage, keys.IS_DEMONSTRATION).sum()) if len(self) else 0
 
     def _check_schema(self, data: TensorDictBase) -> None:
         found = {key: (value.dtype, value.shape[1:]) for key, value in data.items(True, True)}
         expected = self._schema()
         if expected is None:
-            missing = [key for key in self.storage.frame_keys if key not in found]
-            if missing:
-                raise ReplaySchemaError(f"transitions lack {missing}")
+            self.storage.tables(data)  # raises for images that do not fit
             return
         problems = _differences(found, expected)
         if problems:
@@ -152,12 +153,8 @@ def _differences(found: Schema, expected: Schema) -> list[str]:
     problems = [f"missing {key!r}" for key in expected if key not in found]
     problems += [f"unexpected {key!r}" for key in found if key not in expected]
     problems += [
-        f"{key!r} is {_text(*found[key])}, stored as {_text(*expected[key])}"
+        f"{key!r} is {layout(*found[key])}, stored as {layout(*expected[key])}"
         for key in expected
         if key in found and found[key] != expected[key]
     ]
     return sorted(problems)
-
-
-def _text(dtype: torch.dtype, shape: torch.Size) -> str:
-    return f"{str(dtype).removeprefix('torch.')}{list(shape)}"

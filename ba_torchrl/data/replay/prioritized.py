@@ -174,8 +174,8 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
             storage: storage with the expert flags, which TorchRL's buffers pass.
 
         Raises:
-            ValueError: a priority is not finite, an index is beyond ``max_capacity``, or the
-                storage is missing and the bonus is not zero.
+            ValueError: a priority is not finite, there are not as many as indices, an index is
+                beyond ``max_capacity``, or the storage is missing and the bonus is not zero.
         """
         index = torch.stack(index, -1) if isinstance(index, tuple) else index
         index = torch.as_tensor(index, dtype=torch.long, device="cpu")
@@ -186,7 +186,12 @@ class ExpertPrioritizedSampler(OneProcess, StateFolder, PrioritizedSampler):
         if (error == self.default_priority).all():
             return self.mark_update(index)
         if not error.isfinite().all():
-            raise ValueError("a TD error is not finite: the run has diverged")
+            raise ValueError(
+                "a TD error is not finite: the run has diverged, or the batch has a reward, an "
+                "action or an image that is not finite"
+            )
+        if error.numel() not in (1, index.numel()):
+            raise ValueError(f"{error.numel()} priorities for {index.numel()} indices")
         is_stored = index >= 0
         index, error = index[is_stored], error.abs().expand(index.shape)[is_stored]
         if len(index):

@@ -17,6 +17,7 @@ from torchrl.data import LazyTensorStorage, TensorStorage
 from torchrl.data.replay_buffers.storages import Storage
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError, ReplaySchemaError, layout
 from ba_torchrl.core.files import StateFolder
 from ba_torchrl.data.replay.codecs import ImageCodec
 
@@ -51,11 +52,20 @@ def stored_flags(storage: Storage, key: NestedKey, index: slice | Tensor = slice
 
     Returns:
         bool [N], on the CPU.
+
+    Raises:
+        ReplaySchemaError: the items have no such entry.
     """
-    if isinstance(storage, TensorStorage):
-        flags = storage.get(key).flatten(0, storage.ndim - 1)[index]
-    else:
-        flags = torch.stack([item[key] for item in storage.get(index)])
+    try:
+        if isinstance(storage, TensorStorage):
+            flags = storage.get(key).flatten(0, storage.ndim - 1)[index]
+        else:
+            flags = torch.stack([item[key] for item in storage.get(index)])
+    except KeyError:
+        raise ReplaySchemaError(
+            f"the stored transitions lack {key!r}: set this flag before extend, as as_transitions "
+            "does, bool [N, 1]"
+        ) from None
     return flags.unsqueeze(-1).flatten(1).any(1).cpu()
 
 
@@ -71,6 +81,8 @@ class FrameTable:
 
     def __init__(self, shape: torch.Size) -> None:
         self.shape = torch.Size(shape)
+        self.image_shape: torch.Size | None = None
+        """Shape of an image whose code is a frame, None before the first."""
         self.clear()
 
     def clear(self) -> None:
@@ -198,6 +210,8 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
         super().__init__(max_size, device="cpu")
         if not codecs:
             raise ValueError("codecs is empty: there is no image to store")
+        if others := [key for key, codec in codecs.items() if not hasattr(codec, "encode")]:
+            raise ConfigError(f"codecs: {', '.join(others)} has no codec: pass make_codecs(images)")
         self.codecs = dict(codecs)
         self.returns_codes = returns_codes
         self.frame_keys: list[NestedKey] = [
@@ -222,6 +236,9 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
             cursor: indices of the transitions, or a mask.
             data: one transition if ``cursor`` is a number, else a batch or list of them.
             set_cursor: whether the storage's length is extended to these indices, as for a writer.
+
+        Raises:
+            ReplaySchemaError: an image is missing, or of another shape than those stored.
         """
         if isinstance(cursor, slice):
             cursor = range(self.max_size)[cursor]
@@ -233,12 +250,38 @@ class FrameStorage(OneProcess, StateFolder, LazyTensorStorage):
         indices = indices.nonzero()[:, 0] if indices.dtype == torch.bool else indices.long()
         if len(indices) > self.max_size:  # keep the last of each index
             indices, data = indices[-self.max_size :], data[-self.max_size :]
+        tables = self.tables(data)
         super().set(indices, data.exclude(*self.frame_keys), set_cursor=set_cursor)
+        self._frames |= tables
         for number, (key, codec) in enumerate(self.codecs.items()):
             images = [data.get(nested).cpu() for nested in (key, (keys.NEXT, key))]
-            if key not in self._frames:
-                self._frames[key] = FrameTable(codec.encode(images[0][:1]).shape[1:])
-            self._store_frames(indices, images, codec, self._frames[key], self._slots[number])
+            self._store_frames(indices, images, codec, tables[key], self._slots[number])
+
+    def tables(self, data: TensorDictBase) -> dict[str, FrameTable]:
+        """Return the tables that take the images of transitions [N], by key; new ones at first.
+
+        Raises:
+            ReplaySchemaError: an image is missing, or of another shape than those stored.
+        """
+        return {key: self._table(key, data) for key in self.codecs}
+
+    def _table(self, key: str, data: TensorDictBase) -> FrameTable:
+        table = self._frames.get(key)
+        for nested in (key, (keys.NEXT, key)):
+            image = data.get(nested, None)
+            if image is None:
+                raise ReplaySchemaError(f"transitions lack {nested!r}")
+            if table is not None and image.shape[1:] == table.image_shape:
+                continue
+            shape = self.codecs[key].encode(image[:0]).shape[1:]
+            table = FrameTable(shape) if table is None else table
+            if shape != table.shape:
+                raise ReplaySchemaError(
+                    f"{nested!r} is {layout(image.dtype, image.shape[1:])}, and images of another "
+                    "shape are stored or precede it"
+                )
+            table.image_shape = image.shape[1:]
+        return table
 
     @staticmethod
     def _store_frames(

@@ -80,7 +80,7 @@ def plain_trunk(
         CastConv2d(channels, width, 3, padding=padding)
         for channels, (width, padding, _) in zip(inputs, stages, strict=False)
     ]
-    return ImageTrunk(convs, [pools for _, _, pools in stages], config)
+    return ImageTrunk(convs, [pools for _, _, pools in stages], config, spec.image_shape)
 
 
 def build_cnn(config: CNNConfig, spec: ActorCriticSpec) -> ActorCritic:

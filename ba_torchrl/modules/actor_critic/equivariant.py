@@ -278,4 +278,4 @@ def _trunk(config: EquivariantConfig, group: PlanarGroup, spec: ActorCriticSpec)
     pools = [  # a stride halves the image as a pool does
         pools and conv.stride == 1 for (_, _, pools), conv in zip(stages, convs, strict=True)
     ]
-    return ImageTrunk(convs, pools, config)
+    return ImageTrunk(convs, pools, config, spec.image_shape)

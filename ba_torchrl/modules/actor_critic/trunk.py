@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import torch
 import torch.nn.functional as F
@@ -10,7 +10,7 @@ from torch import Tensor, nn
 
 from ba_torchrl.modules.actor_critic.image_config import ImageNetworkConfig
 from ba_torchrl.modules.base import LOG_STD_MAX, LOG_STD_MIN
-from ba_torchrl.modules.layers import XavierInitialised, compute_dtype
+from ba_torchrl.modules.layers import XavierInitialised, check_image, compute_dtype
 from ba_torchrl.modules.steerable.max_pool import relu_of_max_pool
 
 SUPPORTED_IMAGE_SIZES = (64, 128)
@@ -48,18 +48,25 @@ class ImageTrunk(XavierInitialised):
         convs: convolutions that take and return plain tensors in the input's dtype.
         pools: for each, whether a 2x2 max pool follows.
         config: precision and the input's units.
+        shape: of an image, [C, H, W].
     """
 
     def __init__(
-        self, convs: Iterable[nn.Module], pools: Iterable[bool], config: ImageNetworkConfig
+        self,
+        convs: Iterable[nn.Module],
+        pools: Iterable[bool],
+        config: ImageNetworkConfig,
+        shape: Sequence[int],
     ) -> None:
         super().__init__()
         self.convs = nn.ModuleList(convs)
         self.pools = tuple(pools)
         self.config = config
+        self.shape = torch.Size(shape)
 
     def forward(self, depth: Tensor, holding: Tensor, *vectors: Tensor) -> Tensor:
         """Return features [..., F] of depth [..., C, H, W], holding [..., 1] and vectors."""
+        check_image("depth", depth, self.shape)
         leading = depth.shape[:-3]
         x = self._input(depth.flatten(0, -4) if leading else depth[None], holding)
         slope = self.config.negative_slope

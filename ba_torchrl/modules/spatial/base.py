@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from ba_torchrl.core import keys
+from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.modules.layers import compute_dtype, scaled_width
 from ba_torchrl.modules.spatial.spatial_config import SpatialImageConfig
@@ -37,6 +38,9 @@ class SpatialSpec:
     side_m: float = 0.4
 
     def __post_init__(self) -> None:
+        if missing := {keys.HEIGHTMAP, keys.IN_HAND} - set(self.images):
+            found = list(self.images)
+            raise ConfigError(f"images lack {missing}: {found}; ActorCriticSpec takes depth images")
         if not {"x", "y"} <= set(self.components):
             raise ValueError(f"the action needs x and y, got {self.components}")
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
 import torch
 from tensordict.nn import TensorDictModule
@@ -13,8 +14,9 @@ from torchrl.envs.utils import ExplorationType, exploration_type
 
 from ba_torchrl.core import keys
 from ba_torchrl.core.actions import PLACE, TILTS, GridAxis, OpenLoopActions
+from ba_torchrl.core.errors import BatchError
 from ba_torchrl.core.generators import seeded_generator
-from ba_torchrl.modules.layers import widened, widest_float
+from ba_torchrl.modules.layers import check_image, widened, widest_float
 from ba_torchrl.modules.spatial.base import Level, SpatialQNetwork
 
 OBJECT_HEIGHT_M = 0.01
@@ -83,6 +85,11 @@ class SpatialActions:
         Where the yaw of the nearest index is half a turn from the nearest yaw, the fingers are
         swapped, and the tilts are negated: except for the fingers, the tool keeps its pose.
         """
+        if action.shape[-1] != self.actions.size:
+            raise BatchError(
+                f"the actions have shape {list(action.shape)}, and need {self.actions.size} "
+                f"components, one per letter of {self.actions.sequence!r}"
+            )
         is_swapped = self.swaps_fingers(action)
         columns = []
         for name, place, axis in zip(self.components, self._positions, self.axes, strict=True):
@@ -168,6 +175,12 @@ class SpatialValues(nn.Module):
         self.actions = actions
         self.in_keys = [*image_keys, keys.HOLDING]
 
+    def _first(self, heightmap: Tensor, *others: Tensor) -> tuple[Tensor, Any]:
+        """Return the values of the network's first level, and its state."""
+        counts = dict(zip(self.actions.components, self.actions.axes, strict=True))
+        check_image(self.in_keys[0], heightmap, (1, counts["x"].count, counts["y"].count))
+        return self.network.first(heightmap, *others)
+
     def greedy(self, *observation: Tensor) -> tuple[Tensor, Tensor]:
         """Return the greedy choices, level after level, and the last level's value.
 
@@ -177,7 +190,7 @@ class SpatialValues(nn.Module):
         Returns:
             int64 [B, n] and float32 [B, 1].
         """
-        q, state = self.network.first(*observation)
+        q, state = self._first(*observation)
         value, best = q.flatten(1).max(dim=1, keepdim=True)
         chosen = self.actions.unravel(best[:, 0], 0)
         for level in range(1, len(self.actions.levels)):
@@ -194,7 +207,7 @@ class SpatialValues(nn.Module):
                 choices, int64 [B, n].
         """
         *observation, chosen = observation_and_choices
-        q, state = self.network.first(*observation)
+        q, state = self._first(*observation)
         last = len(self.actions.levels) - 1
         if last:
             q = self.network.later(last, state, self.actions.before(chosen, last))
@@ -212,7 +225,7 @@ class SpatialValues(nn.Module):
         """
         *observation, action = observation_and_action
         indices = self.actions.to_indices(action)
-        q, state = self.network.first(*observation)
+        q, state = self._first(*observation)
         found = [(q.flatten(1), self.actions.ravel(indices, 0))]
         for level in range(1, len(self.actions.levels)):
             q = self.network.later(level, state, self.actions.before(indices, level))
@@ -236,7 +249,7 @@ class SpatialValues(nn.Module):
         indices = self.actions.to_indices(moves)
         counts = torch.ones(indices.shape[:2], dtype=torch.bool, device=indices.device)
         chosen = indices[:, 0]
-        q, state = self.network.first(*observation)
+        q, state = self._first(*observation)
         found: list[tuple[Tensor, Tensor]] = []
         for level in range(len(self.actions.levels)):
             if level:

@@ -11,10 +11,10 @@ from torchrl.checkpoint import Checkpoint
 
 import ba_torchrl
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ReplaySchemaError
+from ba_torchrl.core.errors import ConfigError, ReplaySchemaError
 from ba_torchrl.data.replay.codecs import DepthQuantizer
 from ba_torchrl.data.replay.make import make_replay
-from ba_torchrl.data.replay.storage import FrameTable
+from ba_torchrl.data.replay.storage import FrameStorage, FrameTable
 from ba_torchrl.data.transitions import as_transitions
 from ba_torchrl.demonstrations.collect import collect_demonstrations
 from tests.specs import slow_except
@@ -250,7 +250,33 @@ def test_transitions_with_another_schema_are_refused():
     assert_same(rb[:], data)
     with pytest.raises(ReplaySchemaError, match="lack"):
         buffer().extend(data.exclude(keys.DEPTH))
+    with pytest.raises(ReplaySchemaError, match=r"a TensorDict .*, not a list"):
+        buffer().extend(list(data.unbind(0)))
+    unmarked = buffer()
+    unmarked.extend(data.exclude(keys.IS_DEMONSTRATION))
+    with pytest.raises(ReplaySchemaError, match="lack 'is_demonstration': set this flag"):
+        assert unmarked.num_demonstrations
     rb.extend(data.exclude((keys.NEXT, keys.FAULT)))  # the flag is not part of what is stored
+
+
+def test_a_storage_refuses_images_of_another_shape_and_keeps_what_it_has():
+    storage, data = buffer().storage, episode(4, np.random.default_rng(12))
+    bigger = torch.zeros(4, 1, 9, 9)
+    for bad, words in [
+        (data.exclude((keys.NEXT, keys.DEPTH)), r"lack \('next', 'depth'\)"),
+        (data.clone().set((keys.NEXT, keys.DEPTH), bigger), r"'depth'\) is float32\[1, 9, 9\]"),
+    ]:
+        with pytest.raises(ReplaySchemaError, match=words):
+            storage.set(range(4), bad)
+        with pytest.raises(ReplaySchemaError, match=words):
+            buffer().extend(bad)
+    storage.set(range(4), data)
+    others = data.clone().set(keys.DEPTH, bigger).set((keys.NEXT, keys.DEPTH), bigger)
+    with pytest.raises(ReplaySchemaError, match="another shape are stored"):
+        storage.set(range(4), others)
+    assert_same(storage.get(range(4)), data)
+    with pytest.raises(ConfigError, match=r"depth has no codec: pass make_codecs\(images\)"):
+        FrameStorage(4, {keys.DEPTH: None})
 
 
 @pytest.mark.parametrize("how", ["state_dict", "dumps", "Checkpoint"])

@@ -348,6 +348,8 @@ def test_a_restored_sampler_continues_the_same_draws(on_disk, tmp_path):
 
 def test_invalid_arguments_are_refused():
     buffer, sampler = make(FLAGS)
+    with pytest.raises(ValueError, match="3 priorities for 2 indices"):
+        buffer.update_priority(torch.arange(2), torch.rand(3))
     with pytest.raises(ValueError, match="not finite"):
         buffer.update_priority(torch.tensor([0]), torch.tensor([float("nan")]))
     with pytest.raises(ValueError, match="storage"):
