@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import functools
 import os
@@ -50,20 +51,26 @@ def _folder_exists(path: str) -> None:
 
 
 def check_writable_folder(folder: str | Path) -> None:
-    """Check that files can be written to a folder, which is created if needed."""
+    """Check that files can be written to a folder, or that it can be created; nothing is."""
+    folder = Path(folder)
     try:
-        Path(folder).mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
+        there = next(path for path in (folder, *folder.parents) if os.path.lexists(path))
+        for part in folder.relative_to(there).parts:
+            with contextlib.suppress(FileNotFoundError):
+                os.lstat(there / part)  # raises for a name that no folder can have
+        if not there.is_dir():
+            raise ConfigError(f"cannot write to {folder}: {there} is not a folder")
+        with tempfile.TemporaryFile(dir=there):
             pass
-    except FileExistsError:
-        raise ConfigError(f"cannot write to {folder}: it is not a folder") from None
     except (OSError, ValueError) as error:
+        if isinstance(error, ConfigError):
+            raise
         reason = getattr(error, "strerror", error)
         raise ConfigError(f"cannot write to {folder}: {reason}") from None
 
 
 def check_writable_file(path: str | Path, suffixes: Sequence[str] = ()) -> None:
-    """Check that a file can be written; its folder is created if needed."""
+    """Check that a file can be written; neither it nor its folder is created."""
     path = Path(path)
     if suffixes and path.suffix.lower() not in suffixes:
         raise ConfigError(f"the name of the file must end in {' or '.join(suffixes)}")

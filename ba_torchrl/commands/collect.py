@@ -65,10 +65,17 @@ def main(settings: Settings) -> None:
     resolved = resolve_env(task, settings.env)
     if source == "deconstruction":
         check_has_structure(task)
-    from ba_torchrl.demonstrations.collect import collect_demonstrations, source_config
+    from ba_torchrl.demonstrations.collect import (
+        check_noise,
+        check_turn_noise,
+        collect_demonstrations,
+        source_config,
+    )
     from ba_torchrl.demonstrations.demo_files import save_demonstrations
     from ba_torchrl.demonstrations.episodes import is_success, mean_length, success_rate
 
+    check_noise(settings.noise, source, "noise")
+    check_turn_noise(settings.turn_noise, source, resolved.actions.turns, "turn_noise")
     with atomic_output(settings.folder) as scratch:
         with (
             settings.make_env(resolved, seed=seed, **source_config(source)) as env,

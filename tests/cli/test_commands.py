@@ -31,11 +31,13 @@ RUN = {
 }
 LONG = 300 * "n"
 REFUSED = [
-    ("train", "run_dir=file", "it is not a folder"),
+    ("train", "run_dir=file", "is not a folder"),
     ("train", "run_dir=/dev/full/x", "cannot write to "),
     ("train", "demonstrations_source=deconstruction", "deconstruction has no meaning for close_lo"),
     ("benchmark", "only=9999", "only: must be a number from 0 to "),
-    ("benchmark", "folder=file", "it is not a folder"),
+    ("benchmark", "folder=file", "is not a folder"),
+    ("collect", "source=deconstruction noise=0.1 task=open_loop/house_building_1", "no random a"),
+    ("collect", "turn_noise=0.1 env.action_sequence=pxyz", "the actions have no turns"),
     ("collect", "foo=1", "unknown setting 'foo'. Known: "),
     ("collect", "env.seed=5", "env: seed is set by the command; leave it out, and set seed"),
     ("collect", "source=deconstruction", "deconstruction has no meaning for close_loop/block_pick"),
@@ -44,19 +46,34 @@ REFUSED = [
     ("collect", "task=close_loop/block_pulling", "demos/close_loop_block_pulling exists already"),
     ("collect", "plugins=[no_such_module]", "cannot import the plugin 'no_such_module'"),
     ("collect", "plugins=[json.py]", "there is no module 'json.py'. Leave out '.py', run from"),
+    ("play", "video=new/x.gif episodes=0", "episodes: must be at least 1"),
+    ("play", "close_loop/block_picking video=new/x.gif env.obs_sice=64", "unknown parameter"),
+    ("play", "policy=nowhere video=new/x.gif", "unknown policy 'nowhere'"),
+    ("evaluate", "video=new/x.mp4 video_episodes=0", "video_episodes: must be at least 1"),
+    ("evaluate", "result=new/x", "result is for policies of LeRobot"),
+    ("convert", "demos format=minari path=new/x", "demos"),
+    ("graded", "close_loop/block_reaching path=new env.obs_sice=64", "unknown parameter"),
+    ("teleoperate", "open_loop/block_stacking path=new/x", "poses, record its expert"),
     ("evaluate", "env.obs_size=128", "unknown setting 'env'. Known: plugins, num_envs, "),
     ("diagnose", "folder=run", "run exists already; choose another path"),
     ("experts", "env.num_envs=3", "unknown parameter 'num_envs'"),
     ("experts", "env.robot=ur5", "env: robot is set by the command; leave it out, and set robots"),
     ("experts", "env.action_sequence=pxy", "leave it out, and read the column that it names"),
+    ("experts", "path=new/x env.obs_sice=64", "unknown parameter"),
     ("experts", "path=file", "file exists already; choose another path"),
     ("experts", "robots=[kuka,baxter]", "unknown robot 'baxter'"),
     ("gallery", "deconstructions=[open_loop/bin_packing]", "deconstruction has no meaning"),
     ("plot", "runs=[run]", "cannot read the scalars of run"),
+    ("tasks", "path=new/x tasks=[close_loop/none]", "unknown task"),
     ("tasks", "path=file", "file exists already; choose another path"),
+    ("export", "path=new/x.safetensors episodes=0", "episodes: must be at least 1"),
     ("export", "path=file", "file exists already; choose another path"),
     ("gallery", "folder=pictures", "pictures/close_loop_block_reaching.png exists already"),
     ("leaderboard", "runs=demos", "no run below demos"),
+    ("report", "folder=new runs=demos", "no finished run below demos"),
+    ("diagnose", "folder=new/x pictures=-1", "pictures: must be at least 0"),
+    ("soak", "folder=new/x env.obs_sice=64", "unknown parameter"),
+    ("gallery", "folder=new tasks=[close_loop/none]", "unknown task"),
     ("report", "folder=file/x", "cannot write to "),
     ("measure", "output=folder.json", "cannot write to "),
 ]
@@ -97,8 +114,12 @@ def test_recipes_refuse_what_they_cannot_do_before_they_start(
     (tmp_path / "run").mkdir()
     (tmp_path / "run/config.json").write_text(json.dumps(RUN))
     (tmp_path / "run/scalars.csv").write_text("step,name,value\n5,torn\n")
-    with atomic_output(tmp_path / "held"), pytest.raises(SystemExit) as end:
-        recipe(name, *REQUIRED.get(name, ()), override)
+    required = [word for word in REQUIRED.get(name, ()) if f"{word.split('=')[0]}=" not in override]
+    with atomic_output(tmp_path / "held"):
+        before = sorted(tmp_path.rglob("*"))
+        with pytest.raises(SystemExit) as end:
+            recipe(name, *required, *override.split())
+        assert sorted(tmp_path.rglob("*")) == before  # nothing is left of it
     error = capsys.readouterr().err
     assert end.value.code == EXIT_CODE
     assert words in error
