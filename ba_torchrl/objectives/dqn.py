@@ -297,8 +297,8 @@ class LevelDQNLoss(TransitionLoss):
             ``target_value`` (means over the batch; levels averaged).
 
         Raises:
-            KeyError: an entry is missing, such as the demonstration flag if there is a term on
-                demonstrations.
+            BatchError: an entry is missing, such as the demonstration flag if there is a term on
+                demonstrations, or has another type or shape.
         """
         self._prepare(tensordict, next_key(self.tensor_keys.reward), 1)
         if tensordict.ndim != 1:

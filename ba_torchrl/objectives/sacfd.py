@@ -252,8 +252,8 @@ class SACfDLoss(TransitionLoss):
             twin values of the stored actions).
 
         Raises:
-            KeyError: an entry is missing, such as the flag of demonstrations if the behaviour term
-                has a weight.
+            BatchError: an entry is missing, such as the flag of demonstrations if the behaviour
+                term has a weight, or has another type or shape.
         """
         self._prepare(tensordict, self.tensor_keys.action, 1)
         weights = self._importance_weights(tensordict)
