@@ -14,7 +14,7 @@ from torch import Tensor
 from torchrl.envs import Transform
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import BatchError, ConfigError, layout
 from ba_torchrl.core.generators import seeded_generator
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.transfer import to_device
@@ -93,6 +93,13 @@ def image_pairs(images: Iterable[str]) -> list[NestedKey]:
     return [nested for key in images for nested in (key, (keys.NEXT, key))]
 
 
+def check_square(key: str, image: Tensor) -> None:
+    """Raise `BatchError` unless images are [B, C, H, H]."""
+    if image.ndim != 4 or image.shape[-1] != image.shape[-2]:
+        found = layout(image.dtype, image.shape)
+        raise BatchError(f"{key!r} is {found}, and must be square images [B, C, H, H]")
+
+
 def map_pairs(
     tensordict: TensorDictBase, key: str, rows: Tensor, transform: Callable[[Tensor], Tensor]
 ) -> None:
@@ -106,6 +113,7 @@ def map_pairs(
             shape.
     """
     image = tensordict[key]
+    check_square(key, image)
     if not image.is_floating_point():
         raise ConfigError(
             f"{key} holds codes, {image.dtype}: append the rotation after ImageCodecs"

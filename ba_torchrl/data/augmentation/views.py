@@ -15,7 +15,7 @@ from torchrl.envs import Transform
 from ba_torchrl.core import keys
 from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.core.images import ImageSpec
-from ba_torchrl.data.augmentation.so2 import SeededTransform, image_pairs
+from ba_torchrl.data.augmentation.so2 import SeededTransform, check_square, image_pairs
 from ba_torchrl.data.replay.codecs import mapped_bounds
 from ba_torchrl.data.transfer import to_device
 
@@ -185,6 +185,7 @@ class RandomViews(SeededTransform):
         is_paired = self.views == self.target_views == 1
         for key in self.sizes:
             image, following = tensordict[key], tensordict[keys.NEXT, key]
+            check_square(key, image)
             offsets = self._draw(key, image, self.views)
             out.set(key, self._take(key, image, offsets))
             if not is_paired:

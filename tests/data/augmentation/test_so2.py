@@ -9,7 +9,7 @@ from tensordict import TensorDict
 from torchrl.data import LazyTensorStorage, ReplayBuffer
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import BatchError, ConfigError
 from ba_torchrl.core.images import ImageSpec
 from ba_torchrl.data.augmentation.so2 import (
     SO2Augmentation,
@@ -189,6 +189,10 @@ def test_draws_come_from_the_modules_own_generator():
 def test_episodes_of_several_dimensions_are_refused_with_the_way_out():
     with pytest.raises(ConfigError, match=r"SO2Augmentation takes .* \[B\], .*reshape\(-1\)"):
         SO2Augmentation(IMAGES, "pxyzr", seed=0)(batch(n=4).reshape(2, 2))
+    rows = batch()
+    rows[keys.DEPTH] = rows[keys.DEPTH].movedim(1, -1)
+    with pytest.raises(BatchError, match=r"'depth' is float32\[.*, 1\], and must be square images"):
+        SO2Augmentation(IMAGES, "pxyzr", seed=0, probability=1.0)(rows)
     codes = batch()
     codes[keys.DEPTH] = codes[keys.DEPTH].byte()
     with pytest.raises(ConfigError, match=r"depth holds codes, torch.uint8: .* after ImageCodecs"):

@@ -8,7 +8,7 @@ import torch.nn.functional as F
 from tensordict import TensorDict
 
 from ba_torchrl.core import keys
-from ba_torchrl.core.errors import ConfigError
+from ba_torchrl.core.errors import BatchError, ConfigError
 from ba_torchrl.data.augmentation.views import (
     CenterCrop,
     RandomViews,
@@ -175,3 +175,7 @@ def test_a_seed_determines_the_offsets_and_a_state_continues_them():
     assert not torch.equal(first(data)[keys.DEPTH], first(data)[keys.DEPTH])
     with pytest.raises(ValueError, match="views must be positive"):
         views(views=0)
+    flat = batch()
+    flat[keys.DEPTH] = flat[keys.DEPTH][:, 0]
+    with pytest.raises(BatchError, match=r"'depth' is float32\[.*\], and must be square images"):
+        views()(flat)
