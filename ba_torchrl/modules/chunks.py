@@ -196,6 +196,7 @@ class ChunkPolicy(TensorDictModuleBase):
         self.executed = executed
         self.generator = seeded_generator(seed)
 
+    @torch.no_grad()  # else each chunk that is carried on would hold the graphs of all before it
     def forward(self, tensordict: TensorDictBase) -> TensorDictBase:
         """Write ``action`` and ("carried", "action_chunk"), whose first action it is.
 

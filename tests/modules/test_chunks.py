@@ -98,6 +98,7 @@ def test_the_noise_is_constant_unless_the_policy_explores():
     state = TensorDict({"x": torch.ones(3, 2), keys.STEP_COUNT: torch.zeros(3, 1).long()}, [3])
     rows = policy(state.clone())[keys.ACTION]
     assert (rows == rows[0]).all()
+    assert not rows.requires_grad  # else a carried chunk would hold the graphs of all before it
     assert torch.equal(policy(state[:1].clone())[keys.ACTION], rows[:1])
     with set_exploration_type(ExplorationType.RANDOM):
         drawn, again = (random_policy(seed=5)(state.clone())[keys.ACTION] for _ in range(2))
