@@ -12,10 +12,10 @@ from ba_torchrl.core.errors import ConfigError
 from ba_torchrl.record import leaderboard as boards
 from ba_torchrl.record.leaderboard import leaderboard
 from ba_torchrl.record.results import read_result
-from ba_torchrl.record.summary import Run
+from ba_torchrl.record.summary import Run, Section, grouped, load_runs
 from ba_torchrl.tasks.base import TASKS
 from docs import results as page
-from tests.record.test_report import PICK, REACH, policy_test, write_run
+from tests.record.test_report import PICK, REACH, policy_test, texts, write_run
 
 ALL_TASKS = "<!-- results: begin -->\nold\n<!-- results: end -->\nend"
 QUESTION = "<!-- mine: begin -->\nold\n<!-- mine: end -->\nend"
@@ -146,3 +146,15 @@ def test_the_results_of_a_question_are_compared(tmp_path):
     make_run(tmp_path / "alone")
     with pytest.raises(ValueError, match=r"alone is no run of a question: there is no .*/None"):
         page.add([str(tmp_path / "alone")])
+
+
+def test_methods_of_several_numbers_of_demonstrations_are_drawn_over_these(tmp_path):
+    for number, label in ((20, "bc cnn 20"), (5, "bc cnn 5"), (20, "bc cnn 20 noisy")):
+        make_run(tmp_path / label, number / 40, label=label, benchmark="m", demonstrations=number)
+    section = Section("m", grouped(load_runs([str(tmp_path)])[0]))
+    page.plot_demonstrations(section, tmp_path / "one.svg")
+    found = texts(tmp_path / "one.svg")
+    assert {"bc cnn", "demonstrations", REACH} <= {*found}
+    assert "noisy" not in " ".join(found)
+    page.plot_demonstrations(Section("m", section.groups[:1]), tmp_path / "none.svg")
+    assert not (tmp_path / "none.svg").exists()
